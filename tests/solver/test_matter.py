@@ -61,7 +61,7 @@ def test_softness_and_kinds() -> None:
     """Analytic: 1 / (eps − 1), zero for conductors, bounded where matter is like air."""
     eps = np.array([3.0, 1.0, 80.0 - 2.0j, INF, INF])
     them = Matter(eps, np.array([INF, 0.0, INF, 0.0, INF]), np.arange(5))
-    np.testing.assert_allclose(them.softness, [0.5, 1e9, 1 / (79 - 2j), 0.0, 0.0])
+    np.testing.assert_allclose(them.inverse_susceptibility, [0.5, 1e9, 1 / (79 - 2j), 0.0, 0.0])
     assert them.conducting.tolist() == [False, False, False, True, True]
     assert them.free.tolist() == [False, False, False, True, False]
     assert them.lossy

@@ -18,9 +18,9 @@ from capsense.scene import TriMesh
 from capsense.solver.bodies.panels import SurfacePanels, panels_of
 from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.interaction.subpanel_kernels import add_parts
-from capsense.solver.placement.placement_kernels import Leaves, placed
-from capsense.solver.placement.truncation_kernels import reached
-from capsense.solver.selection.selection_kernels import Cut, chosen
+from capsense.solver.placement.placement_kernels import ActiveClusters, placed
+from capsense.solver.placement.truncation_kernels import truncate_to_domain
+from capsense.solver.selection.selection_kernels import ActiveTree, chosen
 from capsense.solver.surface_solver import PRESETS
 from capsense.solver.system.step import prepared
 from capsense.solver.tree.mean_kernels import means_between
@@ -55,43 +55,43 @@ def test_parts_make_up_their_wholes(shape: cs.Shape) -> None:
     parts together, along the panel; those of panels as they were."""
     made = shape_of(shape)
     arrays, tree, m = made._parts, made.tree, len(made.panels)
-    kids, charge, center = arrays["kids"], arrays["charge"], arrays["center"]
+    children, charge, center = arrays["children"], arrays["charge"], arrays["center"]
     stored = 2 * m - 1
-    for name in ("charge", "center", "points", "extent", "soft"):
+    for name in ("charge", "center", "points", "extent", "softening_length"):
         np.testing.assert_array_equal(arrays[name][:stored], getattr(tree, name))
-    inner = np.flatnonzero(kids[:, 0] >= 0)
-    assert len(inner) == len(kids) // 2
-    assert sorted(kids[inner].ravel()) == list(range(1, len(kids)))
-    np.testing.assert_array_equal(kids[inner, 1], kids[inner, 0] + 1)
-    assert (kids[inner, 0] > inner).all()
-    assert sorted(arrays["function"][inner]) == list(range(1, len(kids) // 2 + 1))
-    assert (arrays["function"][kids[:, 0] < 0] == -1).all()
+    inner = np.flatnonzero(children[:, 0] >= 0)
+    assert len(inner) == len(children) // 2
+    assert sorted(children[inner].ravel()) == list(range(1, len(children)))
+    np.testing.assert_array_equal(children[inner, 1], children[inner, 0] + 1)
+    assert (children[inner, 0] > inner).all()
+    assert sorted(arrays["function"][inner]) == list(range(1, len(children) // 2 + 1))
+    assert (arrays["function"][children[:, 0] < 0] == -1).all()
     arms = arrays["points"] - center[:, None]
     second = np.einsum("kqi,kqj->kij", arms, arms) / 4
     panels = np.flatnonzero(tree.panel >= 0)
     second[panels] = made.panels.moments[tree.panel[panels]]
-    cut = inner[kids[inner, 0] >= stored]
-    assert set(cut) > set(panels[kids[panels, 0] >= 0])
+    cut = inner[children[inner, 0] >= stored]
+    assert set(cut) > set(panels[children[panels, 0] >= 0])
     normal = normals_of(made)
     for k in cut:
-        share, along = charge[kids[k]] / charge[k], np.eye(3) - np.outer(normal[k], normal[k])
+        share, along = charge[children[k]] / charge[k], np.eye(3) - np.outer(normal[k], normal[k])
         assert share.sum() == pytest.approx(1.0, abs=1e-12)
-        off = (center[kids[k]] - center[k]) @ along
+        off = (center[children[k]] - center[k]) @ along
         np.testing.assert_allclose(share @ off, 0.0, atol=1e-12)
-        below = along @ second[kids[k]] @ along + off[:, :, None] * off[:, None]
+        below = along @ second[children[k]] @ along + off[:, :, None] * off[:, None]
         whole = np.einsum("p,pij->ij", share, below)
         np.testing.assert_allclose(whole, along @ second[k] @ along, atol=1e-12)
 
 
 def normals_of(shape: RefinedShape) -> Array:
     """Normal of the panel that each part lies in, and of panels; zero for other clusters."""
-    kids = shape._parts["kids"]
-    out = np.zeros((len(kids), 3))
-    for k in range(len(kids)):
+    children = shape._parts["children"]
+    out = np.zeros((len(children), 3))
+    for k in range(len(children)):
         if k < len(shape.tree.panel) and shape.tree.panel[k] >= 0:
             out[k] = shape.panels.normals[shape.tree.panel[k]]
-        if kids[k, 0] >= 0 and out[k].any():
-            out[kids[k]] = out[k]
+        if children[k, 0] >= 0 and out[k].any():
+            out[children[k]] = out[k]
     return out
 
 
@@ -129,11 +129,11 @@ def test_parts_are_as_small_as_asked_for() -> None:
     """Invariant: no longer than that, or a part in 32 of their panel; none where panels are."""
     made = shape_of(BLOCK)
     arrays, panels = made._parts, np.flatnonzero(made.tree.panel >= 0)
-    halvings = np.zeros(len(arrays["kids"]), int)
-    for k in np.flatnonzero(arrays["kids"][:, 0] >= 0):
+    halvings = np.zeros(len(arrays["children"]), int)
+    for k in np.flatnonzero(arrays["children"][:, 0] >= 0):
         if k in panels or halvings[k] > 0:
-            halvings[arrays["kids"][k]] = halvings[k] + 1
-    end = arrays["kids"][:, 0] < 0
+            halvings[arrays["children"][k]] = halvings[k] + 1
+    end = arrays["children"][:, 0] < 0
     assert 3 <= halvings[end].max() <= 5
     assert (arrays["extent"][end & (halvings < 5)] <= 4e-3).all()
     assert (arrays["extent"][~end & (halvings > 0)] > 4e-3).all()
@@ -157,7 +157,7 @@ def test_conductors_have_parts() -> None:
             assert found.finest * size == pytest.approx(0.85 * finest, rel=0.18)
             other = cs.Capsule(*(1.1 * np.array([shape.radius, shape.length])))
             again = functions_of(other, 700, conducting=True, finest=finest)[0]
-            assert again.energy is found.energy
+            assert again.potential_coefficients is found.potential_coefficients
     assert type(functions_of(LIMB, 700, conducting=True)[0]) is RigidShape
 
 
@@ -168,14 +168,14 @@ def pack(shape: RefinedShape, gap: float, eps_r: float = math.inf) -> Array:
     out = np.array([shape.record], BODY)
     out["scale"], out["rotation"] = 1.0, Rotation.from_quat(TURN).as_matrix()
     out["position"] = 0.004, 0.003, gap + 0.04
-    out["softness"] = 1.0 / (eps_r - 1.0)
+    out["inverse_susceptibility"] = 1.0 / (eps_r - 1.0)
     return out
 
 
-def cut_of(bodies: Array) -> tuple[Cut, Leaves]:
+def cut_of(bodies: Array) -> tuple[ActiveTree, ActiveClusters]:
     green = green_of()
     cut = chosen(bodies, green, 0.015, 2.5, facing_of(bodies[:0]))
-    return reached(cut, placed(bodies, cut, green))
+    return truncate_to_domain(cut, placed(bodies, cut, green))
 
 
 @pytest.mark.parametrize(("gap", "eps_r"), [(0.5e-3, math.inf), (2e-3, math.inf), (1e-3, 5.0)])
@@ -184,18 +184,18 @@ def test_means_of_parts(gap: float, eps_r: float) -> None:
     shape = shape_of(LIMB)
     bodies = pack(shape, gap, eps_r)
     cut, leaves = cut_of(bodies)
-    n, stored, node = len(cut.leaves), 2 * len(shape.panels) - 1, cut.node[cut.leaves]
+    n, stored, node = len(cut.active), 2 * len(shape.panels) - 1, cut.node[cut.active]
     found = np.zeros((n, n), np.float32)
     add_parts(bodies, cut, leaves, found)
-    parents = np.full(len(shape._parts["kids"]), -1)
-    inner = np.flatnonzero(shape._parts["kids"][:, 0] >= 0)
-    parents[shape._parts["kids"][inner]] = inner[:, None]
+    parents = np.full(len(shape._parts["children"]), -1)
+    inner = np.flatnonzero(shape._parts["children"][:, 0] >= 0)
+    parents[shape._parts["children"][inner]] = inner[:, None]
     panel = node.copy()
     while (panel >= stored).any():
         panel[panel >= stored] = parents[panel[panel >= stored]]
     part = node >= stored
     assert part.sum() > (4 if ON else 20)
-    weight = np.array([share_of(cut, a) for a in cut.leaves])
+    weight = np.array([share_of(cut, a) for a in cut.active])
     means = means_between(leaves.true).astype(float)
     wanted = np.zeros((n, n))
     for i in np.flatnonzero(part):
@@ -205,16 +205,16 @@ def test_means_of_parts(gap: float, eps_r: float) -> None:
             theirs = (part & (panel == panel[j])) if part[j] else np.arange(n) == j
             q = weight[theirs] / weight[theirs].sum()
             value = means[i, j] - p @ means[np.ix_(mine, theirs)] @ q
-            wanted[i, j] = wanted[j, i] = (1 + 2 * bodies["softness"][0]) * value
+            wanted[i, j] = wanted[j, i] = (1 + 2 * bodies["inverse_susceptibility"][0]) * value
     np.testing.assert_allclose(found, wanted, atol=1e-5 * np.abs(wanted).max())
 
 
-def share_of(cut: Cut, leaf: int) -> float:
+def share_of(cut: ActiveTree, leaf: int) -> float:
     """Share of a cluster that is a leaf in the charge of the body."""
-    share, a = float(cut.whole[leaf]), leaf
+    share, a = float(cut.self_weight[leaf]), leaf
     while a > 0:
-        above = int(np.flatnonzero((cut.kids == a).any(axis=1))[0])
-        share *= cut.parts[above][list(cut.kids[above]).index(a)]
+        above = int(np.flatnonzero((cut.children == a).any(axis=1))[0])
+        share *= cut.child_weights[above][list(cut.children[above]).index(a)]
         a = above
     return share
 
@@ -224,10 +224,10 @@ def halvings_of(shape: RefinedShape, gap: float) -> int:
     cut = cut_of(pack(shape, gap))[0]
     depth = np.full(len(cut.node), -1)
     for a in range(len(cut.node)):
-        if cut.kids[a, 0] >= 0:
-            is_panel = cut.node[cut.kids[a, 0]] >= 2 * len(shape.panels) - 1 and depth[a] < 0
+        if cut.children[a, 0] >= 0:
+            is_panel = cut.node[cut.children[a, 0]] >= 2 * len(shape.panels) - 1 and depth[a] < 0
             depth[a] = 0 if is_panel else depth[a]
-            depth[cut.kids[a]] = depth[a] + 1 if depth[a] >= 0 else -1
+            depth[cut.children[a]] = depth[a] + 1 if depth[a] >= 0 else -1
     return int((depth[cut.fade > 0] + 1).max(initial=0))
 
 
@@ -256,11 +256,11 @@ def test_wholes_have_the_energies_that_are_stored() -> None:
         if a < 0:
             charge[-1 - a] = 1.0
         else:
-            charge[cut.kids[a]] = 1.0, -1.0
+            charge[cut.children[a]] = 1.0, -1.0
         for c in range(len(charge)):
-            if cut.kids[c, 0] >= 0:
-                charge[cut.kids[c]] += cut.parts[c] * charge[c]
-        columns[:, f] = (cut.whole * charge)[cut.leaves]
+            if cut.children[c, 0] >= 0:
+                charge[cut.children[c]] += cut.child_weights[c] * charge[c]
+        columns[:, f] = (cut.self_weight * charge)[cut.active]
     added = columns.T @ pairs @ columns
     whole = functions.number[: functions.solved] < len(shape.panels)
     assert (~whole).sum() > (1 if ON else 5)
@@ -273,9 +273,9 @@ def test_addresses_stay_with_the_shape() -> None:
     """Unit: records point to arrays that the shape holds."""
     shape = shape_of(LIMB)
     record, arrays = shape.record, shape._parts
-    assert record["stored"] == 2 * len(shape.panels) - 1
-    assert 2 * record["n"] - 1 == len(arrays["kids"])
-    assert record["known"] == len(shape.panels)
+    assert record["n_panel_clusters"] == 2 * len(shape.panels) - 1
+    assert 2 * record["n"] - 1 == len(arrays["children"])
+    assert record["n_tabulated"] == len(shape.panels)
     found = ctypes.cast(int(record["charge"]), ctypes.POINTER(ctypes.c_double))
     np.testing.assert_array_equal([found[k] for k in (0, 5)], arrays["charge"][[0, 5]])
     assert shape.nbytes > shape.whole.nbytes

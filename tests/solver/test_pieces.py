@@ -35,7 +35,7 @@ def leaves(tree: module.Clusters, node: int) -> list[int]:
     """Panels of a cluster."""
     if tree.panel[node] >= 0:
         return [int(tree.panel[node])]
-    return leaves(tree, tree.kids[node, 0]) + leaves(tree, tree.kids[node, 1])
+    return leaves(tree, tree.children[node, 0]) + leaves(tree, tree.children[node, 1])
 
 
 # ---- meshes ----
@@ -125,7 +125,7 @@ def test_clusters_are_those_of_the_surface_at_rest() -> None:
     second, _ = mesh_pieces(SurfaceMesh(ball.vertices + rng.normal(size=(642, 3)), rest))
     assert second is first
     assert sorted(leaves(first, 0)) == list(range(1280))
-    parts = [leaves(first, k) for k in first.kids[0]]
+    parts = [leaves(first, k) for k in first.children[0]]
     assert 320 <= len(parts[0]) <= 960
     middles = [ball.triangles_center[p].mean(axis=0) for p in parts]
     assert np.linalg.norm(middles[0] - middles[1]) > 0.03

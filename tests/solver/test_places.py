@@ -34,7 +34,7 @@ def space_of(green: Green) -> Space:
     """What places of single points need."""
     gap = green.gap
     return Space(
-        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
+        green.box, green.active_bounds, green.extent, green.cover, gap.validity, gap.soft.limit
     )  # fmt: skip
 
 
@@ -64,19 +64,19 @@ def test_places_of_many_terminals() -> None:
         ]
         named = {f"{name}_phi": phi for name, phi in zip(LEVELS, phis, strict=True)}
         packed = pack_green(replace(green, **named), sim.design)
-        lead = 8 * math.ceil(terminals / 8)
-        assert (packed.terminals, packed.lead) == (terminals, lead)
+        phi_columns = 8 * math.ceil(terminals / 8)
+        assert (packed.terminals, packed.phi_columns) == (terminals, phi_columns)
         tables = [
             (level.table, phi, getattr(green, f"{name}_modes"))
             for level, phi, name in zip(packed.levels, phis, LEVELS, strict=True)
         ]
-        assert packed.grid.values.shape[1] == lead
+        assert packed.grid.values.shape[1] == phi_columns
         assert (packed.grid.values[:, terminals:] == 0.0).all()
         for table, phi, modes in tables:
             np.testing.assert_array_equal(table[: len(phi), :terminals], phi)
-            assert (table[:, terminals:lead] == 0.0).all()
+            assert (table[:, terminals:phi_columns] == 0.0).all()
             rows, columns = modes.shape
-            np.testing.assert_array_equal(table[:rows, lead : lead + columns], modes)
+            np.testing.assert_array_equal(table[:rows, phi_columns : phi_columns + columns], modes)
 
 
 def test_sensors_of_one_design_share_what_is_packed() -> None:
@@ -150,7 +150,9 @@ def with_validity(green: Green) -> Green:
 def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) -> None:
     """Analytic: smoothsteps over 5 mm, from 15 mm before walls, and from 2.3 to 6.1 h0 behind."""
     green = with_validity(green_of())
-    np.testing.assert_allclose(green.room, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]])
+    np.testing.assert_allclose(
+        green.active_bounds, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]]
+    )
     assert green.cover == 0.0
     assert beyond(around(np.array(center)), space_of(green)) == pytest.approx(expected, abs=1e-9)
 
@@ -195,7 +197,7 @@ def test_clusters_are_looked_at_where_they_are_lifted_to(cover: float) -> None:
     top = float(green.box[1, 2])
     bodies = pack(Placed(shape, (0.0, 0.0, top + 0.0081), (0.0, math.pi / 2, 0.0)))
     tree, raised, point = shape_of(shape).tree, 0, np.zeros((1, 3), np.float32)
-    for k in range(bodies[0]["stored"]):
+    for k in range(bodies[0]["n_panel_clusters"]):
         square, _, _, _ = place(bodies[0], space_of(green), k, point, 0)
         wanted = bodies["rotation"][0] @ tree.center[k] + bodies["position"][0]
         d, m = wanted[2] - top, green.gap.validity
@@ -215,8 +217,8 @@ def test_what_crosses_a_wall_is_split_there() -> None:
     middle, half = leaves.points.mean(axis=1)[:, 0], 0.5 * leaves.extent
     across = np.abs(middle - 0.235) < 0.4 * half
     assert leaves.extent[across].max(initial=0.0) < 0.061
-    assert (leaves.beyond[middle > 0.24] == 1.0).all()
-    assert (leaves.beyond[middle < 0.235] == 0.0).all()
+    assert (leaves.outside_fraction[middle > 0.24] == 1.0).all()
+    assert (leaves.outside_fraction[middle < 0.235] == 0.0).all()
 
 
 def test_lifted_clusters_of_a_body_meet_where_they_are() -> None:
@@ -265,8 +267,8 @@ def test_no_image_attracts_more_than_a_mirror(height: float, stretch: float) -> 
     points[..., 2] += green.box[1, 2]
     one, none = np.ones(1), np.zeros(1)
     leaves = plain_leaves(points, points, side * one, one, none, np.zeros(1, int), none)
-    rows = np.zeros((1, green.lead + 8), np.float32)
-    rows[0, green.lead] = 30.0  # the square of it is what the design answers [1/m]
+    rows = np.zeros((1, green.phi_columns + 8), np.float32)
+    rows[0, green.phi_columns] = 30.0  # the square of it is what the design answers [1/m]
     pairs = np.zeros((1, 1), np.float32)
     bound_images(leaves, rows, pairs, green)
     off = (np.arange(2000) + 0.5) / 2000  # of two points of the square, over its side

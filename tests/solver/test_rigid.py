@@ -43,9 +43,11 @@ def test_the_inside_of_an_open_surface() -> None:
     square = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.1, 0.02], [0.0, 0.1, 0.02]])
     shape = rigid.rigid_shape(panels_of(square[[[0, 1, 2], [0, 2, 3]]], 30))
     assert not shape.panels.closed
-    np.testing.assert_allclose(shape.impedance[1:, 1:], 2.5 * shape.energy[1:, 1:], rtol=1e-6)
-    assert not shape.impedance[0].any()
-    assert not shape.impedance[:, 0].any()
+    np.testing.assert_allclose(
+        shape.neumann_to_dirichlet[1:, 1:], 2.5 * shape.potential_coefficients[1:, 1:], rtol=1e-6
+    )
+    assert not shape.neumann_to_dirichlet[0].any()
+    assert not shape.neumann_to_dirichlet[:, 0].any()
 
 
 def test_rigid_shape_with_screened_panels() -> None:
@@ -55,7 +57,7 @@ def test_rigid_shape_with_screened_panels() -> None:
     assert shape.capacitance == pytest.approx(0.02, rel=0.01)
     share = shape.tree.charge[shape.tree.panel >= 0]
     assert share.min() == pytest.approx(rigid.LEAST_CHARGE * share.max(), rel=1e-3)
-    for values in (shape.tree.points, shape.energy, shape.own):
+    for values in (shape.tree.points, shape.potential_coefficients, shape.own):
         assert np.isfinite(values).all()
 
 
@@ -88,7 +90,12 @@ def test_both_ways_to_the_charge_agree(shape: cs.Shape) -> None:
     panels = panels_of(shape, 30)
     one, other = (rigid.rigid_shape(panels, apart=apart) for apart in (True, False))
     np.testing.assert_allclose(one.tree.charge, other.tree.charge, rtol=1e-6)
-    np.testing.assert_allclose(one.energy, other.energy, rtol=1e-4, atol=1e-5 * one.own.max())
+    np.testing.assert_allclose(
+        one.potential_coefficients,
+        other.potential_coefficients,
+        rtol=1e-4,
+        atol=1e-5 * one.own.max(),
+    )
     total = np.linalg.solve(free_block(panels), np.ones(len(panels))).sum()
     assert one.capacitance == pytest.approx(total, rel=1e-7)
     if isinstance(shape, cs.Sphere):

@@ -36,9 +36,9 @@ from capsense.solver.bodies.blocks import free_block
 from capsense.solver.bodies.panels import panels_of
 from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.interaction.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
-from capsense.solver.selection.evaluation_kernels import Looks
+from capsense.solver.selection.evaluation_kernels import ClusterEvaluation
 from capsense.solver.selection.score_kernels import score
-from capsense.solver.selection.selection_kernels import Cut, choose
+from capsense.solver.selection.selection_kernels import ActiveTree, choose
 from capsense.solver.surface_solver import Preset, SurfaceSolver
 from capsense.solver.system.lossy import solve_lossy
 from capsense.solver.system.step import (
@@ -52,9 +52,9 @@ from capsense.solver.system.step import (
 )
 from capsense.solver.system.system_kernels import Reduced, _products, factorise, reduced
 from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.dynamic_surface import ChangingBody
+from capsense.solver.tree.dynamic_surface import DynamicBody
 from capsense.solver.tree.matter import CONDUCTING, UNIT
-from capsense.solver.tree.mean_kernels import four_points
+from capsense.solver.tree.mean_kernels import quadrature4
 from capsense.solver.tree.rigid import BODY, Clusters, RigidShape, rigid_shape, split
 
 Array = np.ndarray
@@ -105,7 +105,7 @@ class Scene(tuple[tuple[Piece, RigidShape], ...]):
 
     @property
     def trees(self) -> list[tuple[Array, Array, Array]]:
-        return [(s.tree.kids, s.tree.panel, charge_of(s)) for _, s in self]
+        return [(s.tree.children, s.tree.panel, charge_of(s)) for _, s in self]
 
     def packed(self) -> Array:
         """The same for the kernels."""
@@ -118,13 +118,13 @@ class Scene(tuple[tuple[Piece, RigidShape], ...]):
             joined = piece.group is not None
             out["neutral"][k] = piece.neutral and not joined
             if joined:
-                out["tie"][k] = 1e8 if piece.neutral else piece.tie.real
+                out["ground_elastance"][k] = 1e8 if piece.neutral else piece.ground_elastance.real
             elif not piece.neutral:
-                out["tie"][k] = piece.tie.real
+                out["ground_elastance"][k] = piece.ground_elastance.real
             if np.isfinite(piece.eps_r):
-                out["impedance"][k] = shape.impedance.ctypes.data
-                out["softness"][k] = (1 / (piece.eps_r - 1)).real
-                out["stiffer"][k] = 2.0 * abs(1 / (piece.eps_r - 1))
+                out["neumann_to_dirichlet"][k] = shape.neumann_to_dirichlet.ctypes.data
+                out["inverse_susceptibility"][k] = (1 / (piece.eps_r - 1)).real
+                out["polarization_stiffness"][k] = 2.0 * abs(1 / (piece.eps_r - 1))
         return out
 
     def solved(self, threshold: float = ALL) -> Solution:
@@ -241,9 +241,9 @@ def test_all_functions_together_are_the_panels(name: str) -> None:
     scene = scenes()[name]
     assert fewer(96) <= max(len(p.panels) for p in scene.pieces) <= 200
     found = scene.solved()
-    wanted = twin.galerkin(scene.pieces, exact(), packed_green().room)
+    wanted = twin.galerkin(scene.pieces, exact(), packed_green().active_bounds)
     assert apart(found.delta, wanted) < limit(3e-5, 6e-4)
-    assert np.abs(found.left).max() < 1e-6 * np.abs(found.delta).max()
+    assert np.abs(found.residual_correction).max() < 1e-6 * np.abs(found.delta).max()
 
 
 @pytest.mark.parametrize("threshold", [0.015, 0.2])
@@ -257,25 +257,27 @@ def test_chosen_functions_are_solved_and_the_others_estimated(name: str, thresho
     cut = prepared_alone(scene.packed(), threshold)[0]
     chosen = chosen_of(cut, len(scene))
     delta, left, coarse = twin.reduced(
-        scene.pieces, scene.trees, chosen, exact(), packed_green().room
+        scene.pieces, scene.trees, chosen, exact(), packed_green().active_bounds
     )
     found = scene.solved(threshold)
     assert apart(found.delta, delta) < limit(6e-4, 4e-3)
     near = limit(3e-4, 1e-3) * np.abs(delta).max()
-    assert np.abs(found.left - left).max() < near
-    assert np.abs(found.coarse - coarse).max() < near
+    assert np.abs(found.residual_correction - left).max() < near
+    assert np.abs(found.discretization_error - coarse).max() < near
     assert np.abs(left).max() > limit(1e-3, 0.0) * np.abs(delta).max()
 
 
-def chosen_of(cut: Cut, bodies: int) -> list[twin.Chosen]:
+def chosen_of(cut: ActiveTree, bodies: int) -> list[twin.Chosen]:
     out = []
-    split = cut.kids[:, 0] >= 0
-    entered = np.clip(cut.above / 0.1, 0, 1)
+    split = cut.children[:, 0] >= 0
+    entered = np.clip(cut.parent_fade / 0.1, 0, 1)
     whole = np.where(split, 1 - entered**2 * (3 - 2 * entered), 1.0)
     for b in range(bodies):
         leaf, at = (cut.body == b) & (whole > 0), (cut.body == b) & split
         out.append(
-            twin.Chosen(cut.node[leaf], whole[leaf], cut.node[at], cut.fade[at], cut.above[at])
+            twin.Chosen(
+                cut.node[leaf], whole[leaf], cut.node[at], cut.fade[at], cut.parent_fade[at]
+            )
         )
     return out
 
@@ -301,7 +303,7 @@ def test_charges_on_the_leaves(name: str) -> None:
         else:
             assert np.abs(net).max() > np.abs(own).max()
     phi = twin.four_point_mean(found.points, exact(), "phi0")
-    phi *= 1.0 - twin.beyond(found.points, packed_green().room)[:, None]
+    phi *= 1.0 - twin.beyond(found.points, packed_green().active_bounds)[:, None]
     assert apart(phi.T @ found.charge[:, :m], found.delta) < 3e-5
 
 
@@ -383,24 +385,29 @@ def test_haar_functions(shape: cs.Shape) -> None:
     """Differential: integrals with functions and their energies, by an explicit matrix."""
     found = shape_of(shape)
     tree, n = found.tree, len(found.panels)
-    haar = twin.haar(tree.kids, tree.panel, charge_of(found))
-    np.testing.assert_array_equal(tree.function[tree.kids[:, 0] >= 0], np.arange(1, n))
+    haar = twin.haar(tree.children, tree.panel, charge_of(found))
+    np.testing.assert_array_equal(tree.function[tree.children[:, 0] >= 0], np.arange(1, n))
     np.testing.assert_allclose(haar.sum(axis=0), np.eye(n)[0], atol=1e-12)
     assert np.linalg.matrix_rank(haar) == n
     rows, out = np.random.default_rng(1).normal(size=(n, 300)), np.empty((n, 300))
-    tree_kernels.to_functions(rows, tree.kids, tree.panel, tree.charge, tree.function, out)
+    tree_kernels.to_functions(rows, tree.children, tree.panel, tree.charge, tree.function, out)
     np.testing.assert_allclose(out, haar.T @ rows, rtol=0, atol=1e-12)
     energy = haar.T @ free_block(found.panels) @ haar
-    np.testing.assert_allclose(found.energy, energy, rtol=0, atol=1e-6 * energy.max())
-    np.testing.assert_allclose(found.own, np.diag(energy), rtol=1e-6)
+    np.testing.assert_allclose(
+        found.potential_coefficients, energy, rtol=0, atol=1e-6 * energy.max()
+    )
+    np.testing.assert_allclose(found.diagonal, np.diag(energy), rtol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [BALL, FINGER, BOX], ids=repr)
 def test_the_first_function_is_at_one_potential(shape: cs.Shape) -> None:
     """Invariant: no other function feels the equilibrium charge, whose energy is 1 / C."""
     found = shape_of(shape)
-    assert np.abs(found.energy[0, 1:]).max() < 1e-5 * found.energy[0, 0]
-    assert found.energy[0, 0] * found.capacitance == pytest.approx(1.0, rel=1e-6)
+    assert (
+        np.abs(found.potential_coefficients[0, 1:]).max()
+        < 1e-5 * found.potential_coefficients[0, 0]
+    )
+    assert found.potential_coefficients[0, 0] * found.capacitance == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.parametrize("shape", [BALL, FINGER, BOX, cs.Box((0.3, 0.3, 0.001))], ids=repr)
@@ -410,7 +417,7 @@ def test_equilibrium_charge_of_panels_apart(shape: cs.Shape) -> None:
     found, wanted = rigid_shape(panels, apart=True), rigid_shape(panels)
     assert found.capacitance == pytest.approx(wanted.capacitance, rel=1e-8)
     np.testing.assert_allclose(found.tree.charge, wanted.tree.charge, rtol=1e-4)
-    np.testing.assert_array_equal(found.tree.kids, wanted.tree.kids)
+    np.testing.assert_array_equal(found.tree.children, wanted.tree.children)
 
 
 @pytest.mark.parametrize("shape", [BALL, FINGER, BOX, CYLINDER], ids=repr)
@@ -419,13 +426,13 @@ def test_clusters_have_the_moments_of_their_panels(shape: cs.Shape) -> None:
     found = shape_of(shape)
     tree, charge = found.tree, charge_of(found)
     size = np.ptp(found.panels.centers, axis=0).max()
-    for k, own in enumerate(twin.members(tree.kids, tree.panel)):
+    for k, own in enumerate(twin.members(tree.children, tree.panel)):
         center, second = twin.charge_moments(
             found.panels, np.where(np.isin(np.arange(len(charge)), own), charge, 0.0)
         )
         assert tree.charge[k] == pytest.approx(charge[own].sum(), rel=1e-12)
         np.testing.assert_allclose(tree.center[k], center, atol=1e-12 * size)
-        check_points(tree.points[k], tree.extent[k], tree.soft[k], center, second)
+        check_points(tree.points[k], tree.extent[k], tree.softening_length[k], center, second)
 
 
 def check_points(points: Array, extent: float, soft: float, center: Array, second: Array) -> None:
@@ -440,18 +447,18 @@ def check_points(points: Array, extent: float, soft: float, center: Array, secon
 
 
 def check_tree(clusters: Clusters, n: int) -> None:
-    kids, panel = clusters.kids, clusters.panel
-    assert kids.shape == (2 * n - 1, 2)
-    single = kids[:, 0] < 0
+    children, panel = clusters.children, clusters.panel
+    assert children.shape == (2 * n - 1, 2)
+    single = children[:, 0] < 0
     np.testing.assert_array_equal(single, panel >= 0)
     np.testing.assert_array_equal(single, clusters.function < 0)
     np.testing.assert_array_equal(np.sort(panel[single]), np.arange(n))
     # breadth first: parts come one after the other, behind the whole, in the order of wholes
-    np.testing.assert_array_equal(kids[~single].ravel(), np.arange(1, 2 * n - 1))
-    assert (kids[~single, 0] > np.flatnonzero(~single)).all()
-    sizes = [len(m) for m in twin.members(kids, panel)]
+    np.testing.assert_array_equal(children[~single].ravel(), np.arange(1, 2 * n - 1))
+    assert (children[~single, 0] > np.flatnonzero(~single)).all()
+    sizes = [len(m) for m in twin.members(children, panel)]
     assert sizes[0] == n
-    for whole, (a, b) in zip(np.flatnonzero(~single), kids[~single], strict=True):
+    for whole, (a, b) in zip(np.flatnonzero(~single), children[~single], strict=True):
         assert sizes[whole] == sizes[a] + sizes[b]
         assert sizes[a] > 0
         assert sizes[b] > 0
@@ -472,7 +479,7 @@ def test_split_is_a_tree(n: int, kind: str) -> None:
     found = split(features, charge)
     check_tree(found, n)
     again = split(features.copy(), charge.copy())
-    for name in ("kids", "panel", "function"):
+    for name in ("children", "panel", "function"):
         np.testing.assert_array_equal(getattr(found, name), getattr(again, name))
 
 
@@ -483,7 +490,7 @@ def test_split_cuts_across_what_varies_most() -> None:
     features[:20, 1] += 10.0
     features[::2, 5] += 3.0
     found = split(features, np.ones(40))
-    parts = twin.members(found.kids, found.panel)
+    parts = twin.members(found.children, found.panel)
     assert {frozenset(parts[1]), frozenset(parts[2])} == {
         frozenset(range(20)), frozenset(range(20, 40)),
     }  # fmt: skip
@@ -522,8 +529,8 @@ def test_split_takes_the_cut_in_the_middle(kind: str) -> None:
             features, charges = np.round(16.0 * features), np.ones(n)
         features *= scale
         clusters = split(features, charges)
-        parts = twin.members(clusters.kids, clusters.panel)
-        for k, (a, _) in enumerate(clusters.kids.tolist()):
+        parts = twin.members(clusters.children, clusters.panel)
+        for k, (a, _) in enumerate(clusters.children.tolist()):
             if a < 0:
                 continue
             own = parts[k]
@@ -537,7 +544,7 @@ def test_split_of_panels_that_do_not_differ_halves_them() -> None:
     """Analytic: equal features make a tree of least depth."""
     found = split(np.ones((64, 6)), np.ones(64))
     depth = np.zeros(127, int)
-    for k, parts in enumerate(found.kids):
+    for k, parts in enumerate(found.children):
         if parts[0] >= 0:
             depth[parts] = depth[k] + 1
     assert (depth[found.panel >= 0] == 6).all()
@@ -550,23 +557,29 @@ def test_prune_keeps_the_clusters_of_what_stays(share: float) -> None:
     tree, n = shape.tree, len(shape.panels)
     wanted = np.random.default_rng(5).uniform(size=n) < share
     wanted[7] = True
-    kids, panel = np.full((2 * n - 1, 2), -9), np.full(2 * n - 1, -9)
+    children, panel = np.full((2 * n - 1, 2), -9), np.full(2 * n - 1, -9)
     function = np.full(2 * n - 1, -9)
     m = tree_kernels.prune(
-        tree.kids, tree.panel, wanted, kids, panel, function, np.empty((2, 2 * n - 1), np.int64)
+        tree.children,
+        tree.panel,
+        wanted,
+        children,
+        panel,
+        function,
+        np.empty((2, 2 * n - 1), np.int64),
     )
     assert m == wanted.sum()
-    kids, panel, function = kids[: 2 * m - 1], panel[: 2 * m - 1], function[: 2 * m - 1]
+    children, panel, function = children[: 2 * m - 1], panel[: 2 * m - 1], function[: 2 * m - 1]
     number = np.cumsum(wanted) - 1
-    check_tree(Clusters(kids, function, np.where(panel >= 0, number[panel], -1)), int(m))
-    np.testing.assert_array_equal(function[kids[:, 0] >= 0], np.arange(1, m))
-    new = {frozenset(c.tolist()) for c in twin.members(kids, panel)}
-    old = {frozenset(c[wanted[c]].tolist()) for c in twin.members(tree.kids, tree.panel)}
+    check_tree(Clusters(children, function, np.where(panel >= 0, number[panel], -1)), int(m))
+    np.testing.assert_array_equal(function[children[:, 0] >= 0], np.arange(1, m))
+    new = {frozenset(c.tolist()) for c in twin.members(children, panel)}
+    old = {frozenset(c[wanted[c]].tolist()) for c in twin.members(tree.children, tree.panel)}
     assert new == old - {frozenset()}
-    changing = ChangingBody(tree, shape.panels, wanted)
+    changing = DynamicBody(tree, shape.panels, wanted)
     assert changing.record["n"] == m
     charge = (ctypes.c_double * (2 * m - 1)).from_address(int(changing.record["charge"]))
-    for k, own in enumerate(twin.members(kids, panel)):
+    for k, own in enumerate(twin.members(children, panel)):
         assert charge[k] == pytest.approx(shape.panels.areas[own].sum(), rel=1e-12)
 
 
@@ -582,8 +595,8 @@ def test_moments_of_random_clusters() -> None:
     charge, center, spread = np.empty(99), np.empty((99, 3)), np.empty((99, 3, 3))
     at = clusters.panel[single]
     charge[single], center[single], spread[single] = q[at], x[at], own[at]
-    tree_kernels.moments(clusters.kids, clusters.panel, charge, center, spread)
-    for k, part in enumerate(twin.members(clusters.kids, clusters.panel)):
+    tree_kernels.moments(clusters.children, clusters.panel, charge, center, spread)
+    for k, part in enumerate(twin.members(clusters.children, clusters.panel)):
         weight = q[part] / q[part].sum()
         middle = weight @ x[part]
         off = x[part] - middle
@@ -600,7 +613,7 @@ def test_four_points_have_the_largest_moments(rank: int) -> None:
     for size in 10.0 ** rng.uniform(-5, 0, 40):
         half = size * rng.normal(size=(3, rank)) * 10.0 ** rng.uniform(-2, 0, rank)
         points, center = np.empty((4, 3)), size * rng.normal(size=3)
-        extent, soft = four_points(half @ half.T, center, np.empty((3, 3)), points)
+        extent, soft = quadrature4(half @ half.T, center, np.empty((3, 3)), points)
         check_points(points, extent, soft, center, half @ half.T)
 
 
@@ -608,14 +621,14 @@ def test_four_points_of_even_and_diagonal_moments() -> None:
     """Analytic: equal moments are kept whichever two are taken; none at all gives the centre."""
     for second in (np.eye(3), np.diag([1.0, 4.0, 4.0]), np.diag([9.0, 0.0, 1.0])):
         points = np.empty((4, 3))
-        extent, soft = four_points(second.copy(), np.zeros(3), np.empty((3, 3)), points)
+        extent, soft = quadrature4(second.copy(), np.zeros(3), np.empty((3, 3)), points)
         found = np.sort(np.linalg.eigvalsh(points.T @ points / 4))
         np.testing.assert_allclose(found[1:], np.sort(np.diag(second))[1:], rtol=1e-12)
         assert extent == pytest.approx(math.sqrt(12 * second.max()))
         wanted = 0.0225 * 12 * second.max() + 0.82 * np.diag(second).min()
         assert soft == pytest.approx(math.sqrt(wanted))
     points = np.empty((4, 3))
-    assert four_points(np.zeros((3, 3)), np.ones(3), np.empty((3, 3)), points) == (0.0, 0.0)
+    assert quadrature4(np.zeros((3, 3)), np.ones(3), np.empty((3, 3)), points) == (0.0, 0.0)
     np.testing.assert_array_equal(points, np.ones((4, 3)))
 
 
@@ -952,17 +965,17 @@ def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold
 # ---- which functions ----
 
 
-def fill_scores(looks: Looks, row: int, scores: Array) -> None:
+def fill_scores(looks: ClusterEvaluation, row: int, scores: Array) -> None:
     """Fill in what was found from a row on, that of a body's first cluster."""
     rows = [row]
     while rows:
         row = rows.pop()
         scores[looks.node[row]] = looks.score[row]
-        if looks.kids[row] >= 0:
-            rows += [looks.kids[row], looks.kids[row] + 1]
+        if looks.children[row] >= 0:
+            rows += [looks.children[row], looks.children[row] + 1]
 
 
-def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
+def cut_of(scene: Scene, threshold: float) -> tuple[ActiveTree, Array, Array]:
     """The cut, the scores with those that are inherited, and each body's first cluster."""
     bodies = scene.packed()
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
@@ -973,11 +986,11 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     for b, row in enumerate(rows[:-1]):
         fill_scores(looks, row, scores[first[b] : first[b + 1]])
     for o, (_, shape) in zip(first, scene, strict=False):
-        kids = shape.tree.kids
-        for k in np.flatnonzero(kids[:, 0] >= 0):
-            for part in kids[k]:
+        children = shape.tree.children
+        for k in np.flatnonzero(children[:, 0] >= 0):
+            for part in children[k]:
                 if not scores[o + part] >= 0:
-                    scores[o + part] = twin.DECAY * scores[o + k] if kids[part, 0] >= 0 else 0.0
+                    scores[o + part] = twin.DECAY * scores[o + k] if children[part, 0] >= 0 else 0.0
     return cut, scores, first
 
 
@@ -990,7 +1003,7 @@ def test_scores(name: str) -> None:
 @pytest.mark.parametrize("scale", [1.0, 1.7])
 def test_scores_of_a_body_on_a_capacitance_across_a_wall(scale: float) -> None:
     """Differential: its net charge costs the energy of the capacitance too."""
-    wall = float(packed_green().room[1, 0])
+    wall = float(packed_green().active_bounds[1, 0])
     check_scores(Scene([body(BOX, (wall - 0.01, 0.0, 0.05), tie=20.0, scale=scale)]))
 
 
@@ -999,7 +1012,7 @@ def test_scores_of_a_wide_body_without_net_charge_across_a_wall(
     height: float, scale: float
 ) -> None:
     """Differential: its large clusters are split only where it counts itself."""
-    wall = float(packed_green().room[1, 0])
+    wall = float(packed_green().active_bounds[1, 0])
     wide = body(BOX, (wall - 0.01, 0.0, height), scale=scale, tie=NONE)
     check_scores(Scene([body(BALL, (0.0, 0.0, 0.05)), wide]))
 
@@ -1019,34 +1032,34 @@ def test_scores_and_fades_fall_downwards(name: str) -> None:
     scene = scenes()[name]
     cut, scores, first = cut_of(scene, 0.05)
     for b, (_, shape) in enumerate(scene):
-        kids = shape.tree.kids
-        for k in np.flatnonzero(kids[:, 0] >= 0):
-            assert scores[first[b] + k] >= scores[first[b] + kids[k]].max()
-    assert ((cut.fade >= 0) & (cut.fade <= cut.above) & (cut.above <= 1)).all()
+        children = shape.tree.children
+        for k in np.flatnonzero(children[:, 0] >= 0):
+            assert scores[first[b] + k] >= scores[first[b] + children[k]].max()
+    assert ((cut.fade >= 0) & (cut.fade <= cut.parent_fade) & (cut.parent_fade <= 1)).all()
     places = {(b, k): a for a, (b, k) in enumerate(zip(cut.body, cut.node, strict=True))}
-    for a, parts in enumerate(cut.kids):
+    for a, parts in enumerate(cut.children):
         if parts[0] < 0:
             assert cut.fade[a] == 0
             continue
         assert (parts > a).all()
         tree = scene[cut.body[a]][1].tree
-        assert [places[cut.body[a], k] for k in tree.kids[cut.node[a]]] == parts.tolist()
-        assert (cut.above[parts] == cut.fade[a]).all()
-        assert cut.share[a] == pytest.approx(
-            tree.charge[tree.kids[cut.node[a], 0]] / tree.charge[cut.node[a]]
+        assert [places[cut.body[a], k] for k in tree.children[cut.node[a]]] == parts.tolist()
+        assert (cut.parent_fade[parts] == cut.fade[a]).all()
+        assert cut.charge_fraction[a] == pytest.approx(
+            tree.charge[tree.children[cut.node[a], 0]] / tree.charge[cut.node[a]]
         )
         if cut.fade[a] == 0:  # split for the estimate only
-            assert (cut.kids[parts] < 0).all()
+            assert (cut.children[parts] < 0).all()
     x = np.log(scores[first[cut.body] + cut.node] / 0.05 + 1e-300) / math.log(WIDTH)
     x = np.clip(x, 0, 1)
-    parted = cut.kids[:, 0] >= 0
-    wanted = np.minimum(x * x * (3 - 2 * x), cut.above)
+    parted = cut.children[:, 0] >= 0
+    wanted = np.minimum(x * x * (3 - 2 * x), cut.parent_fade)
     np.testing.assert_allclose(cut.fade[parted], wanted[parted], atol=1e-12)
-    entered = np.clip(cut.above / 0.1, 0, 1)
+    entered = np.clip(cut.parent_fade / 0.1, 0, 1)
     wanted = np.where(parted, 1 - entered * entered * (3 - 2 * entered), 1.0)
-    np.testing.assert_allclose(cut.whole, wanted, atol=1e-12)
-    np.testing.assert_array_equal(cut.leaves, np.flatnonzero(cut.whole > 0))
-    np.testing.assert_array_equal(cut.leaf[cut.leaves], np.arange(len(cut.leaves)))
+    np.testing.assert_allclose(cut.self_weight, wanted, atol=1e-12)
+    np.testing.assert_array_equal(cut.active, np.flatnonzero(cut.self_weight > 0))
+    np.testing.assert_array_equal(cut.active_index[cut.active], np.arange(len(cut.active)))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -1082,7 +1095,7 @@ def test_converges_as_the_threshold_falls(name: str) -> None:
     for threshold in (0.5, 0.05, 5e-3, 5e-4):
         found = scenes()[name].solved(threshold)
         errors.append(np.abs(found.delta - wanted).max() / scale)
-        left.append(np.abs(found.left).max() / scale)
+        left.append(np.abs(found.residual_correction).max() / scale)
     assert left == sorted(left, reverse=True)
     at_wall = "across" in name
     assert errors[1] < (0.65 if at_wall else 0.45) * errors[0]
@@ -1101,11 +1114,11 @@ def test_changing_and_rigid_bodies_agree(shape: cs.Shape, neutral: bool) -> None
     rigid = shape_of(shape, 400)
     piece = Piece(rigid.panels, (0.01, 0.0, 0.055), (0.1, 0.2, 0.3), tie=NONE if neutral else 0.0)
     records = Scene([(piece, rigid)]).packed()
-    changing = ChangingBody(rigid.tree, rigid.panels)
+    changing = DynamicBody(rigid.tree, rigid.panels)
     other = records.copy()
-    for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
+    for name in ("children", "function", "charge", "center", "spread", "own", "extent"):
         other[name] = changing.record[name]
-    other["energy"] = other["points"] = 0
+    other["potential_coefficients"] = other["points"] = 0
     for threshold in (0.015, 1e-4):
         wanted = solve(records, packed_green(), threshold, WIDTH, False)
         found = solve(other, packed_green(), threshold, WIDTH, False)
@@ -1118,7 +1131,7 @@ def test_changing_and_rigid_bodies_agree(shape: cs.Shape, neutral: bool) -> None
 
 def lossily(scene: Scene, threshold: float) -> Solution:
     """Solve with complex energies."""
-    ties = np.array([complex(p.tie) for p in scene.pieces])
+    ties = np.array([complex(p.ground_elastance) for p in scene.pieces])
     soft = np.array([1 / (p.eps_r - 1) if np.isfinite(p.eps_r) else 0.0 for p in scene.pieces])
     return solve_lossy(scene.packed(), ties, soft.astype(complex), packed_green(), threshold, WIDTH)
 
@@ -1132,7 +1145,7 @@ def test_lossy_without_losses(name: str, threshold: float) -> None:
     scene = scenes()[name]
     found, wanted = lossily(scene, threshold), scene.solved(threshold)
     assert apart(found.delta, wanted.delta) < 1e-6
-    assert np.abs(found.left - wanted.left).max() < 1e-6 * np.abs(wanted.delta).max()
+    assert np.abs(found.residual_correction - wanted.left).max() < 1e-6 * np.abs(wanted.delta).max()
     assert apart(found.charge, wanted.charge[:, : found.charge.shape[1]]) < 1e-5
 
 
@@ -1155,7 +1168,7 @@ def test_lossy_functions_together_are_the_panels(shape: cs.Shape, eps: complex) 
             [body(shape, (0.01, 0.0, 0.05), TILTED, tie=tie, eps_r=eps),
              body(FINGER, (0.0, 0.08, 0.05))]
         )  # fmt: skip
-        wanted = twin.galerkin(scene.pieces, exact(), packed_green().room)
+        wanted = twin.galerkin(scene.pieces, exact(), packed_green().active_bounds)
         assert apart(lossily(scene, ALL).delta, wanted) < 3e-5
 
 
@@ -1218,9 +1231,9 @@ def test_ties_of_conductors() -> None:
     """Analytic: none at ground, no net charge if floating, 4π eps0 / C on a capacitance."""
     found = packed(cube(-2, "grounded"), cube(0, "floating"), cube(2, 5e-12))
     assert found["neutral"].tolist() == [0, 1, 0]
-    np.testing.assert_allclose(found["tie"], [0.0, 0.0, UNIT / 5e-12])
+    np.testing.assert_allclose(found["ground_elastance"], [0.0, 0.0, UNIT / 5e-12])
     assert found["group"].tolist() == [0, 1, 2]
-    assert (found["softness"] == 0).all()
+    assert (found["inverse_susceptibility"] == 0).all()
 
 
 def test_matter_of_dielectrics() -> None:
@@ -1230,12 +1243,12 @@ def test_matter_of_dielectrics() -> None:
         cube(3, "floating", cs.Material("m", 5000)),
     )
     assert found["neutral"].tolist() == [1, 1, 1]
-    np.testing.assert_allclose(found["softness"], [1 / 2, 1 / 199, 1 / 4999])
-    assert (found["impedance"] != 0).all()
+    np.testing.assert_allclose(found["inverse_susceptibility"], [1 / 2, 1 / 199, 1 / 4999])
+    assert (found["neumann_to_dirichlet"] != 0).all()
     tied = packed(cube(0, "grounded", cs.Material("m", 5000)))
     size = shape_of(cs.Box((0.02, 0.03, 0.03)), 300).capacitance
     assert tied["neutral"][0] == 0
-    assert tied["tie"][0] == pytest.approx(5.0 / (5000 * size), rel=1e-6)
+    assert tied["ground_elastance"][0] == pytest.approx(5.0 / (5000 * size), rel=1e-6)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (2, 1, 0), (1, 0, 2)])
@@ -1245,7 +1258,7 @@ def test_three_in_a_row_are_one_conductor(order: tuple[int, ...]) -> None:
     found = packed(*(cube(k - 1, states[k]) for k in order))
     assert found["group"].tolist() == [0, 0, 0]
     assert found["neutral"].tolist() == [0, 0, 0]
-    np.testing.assert_allclose(found["tie"], UNIT / 5e-12)
+    np.testing.assert_allclose(found["ground_elastance"], UNIT / 5e-12)
     found = packed(*(cube(1.1 * (k - 1), states[k]) for k in order))
     assert found["group"].tolist() == [0, 1, 2]
     assert sorted(found["neutral"].tolist()) == [0, 0, 1]
@@ -1255,7 +1268,7 @@ def test_one_grounded_conductor_grounds_all_that_touch() -> None:
     """Invariant: the first of three in a row is at ground, and so is the last."""
     found = packed(cube(-1, "grounded"), cube(0, "floating"), cube(1, 1e-12))
     assert found["neutral"].tolist() == [0, 0, 0]
-    assert (found["tie"] == 0).all()
+    assert (found["ground_elastance"] == 0).all()
     mixed = reading(cube(-1, "grounded"), cube(0, "floating"), cube(1, 1e-12))
     assert apart(mixed, reading(*(cube(k, "grounded") for k in (-1, 0, 1)))) < 1e-9
 
@@ -1292,7 +1305,7 @@ def test_threads_that_meet_a_shape_share_its_arrays() -> None:
 
     def met(_: int) -> tuple[int, int]:
         start.wait()
-        return shape.impedance.ctypes.data, shape.own.ctypes.data
+        return shape.neumann_to_dirichlet.ctypes.data, shape.own.ctypes.data
 
     with ThreadPoolExecutor(4) as pool:
         assert len(set(pool.map(met, range(4)))) == 1

@@ -18,7 +18,7 @@ from capsense.solver.bodies.blocks import free_block, impedance
 from capsense.solver.bodies.panels import panels_of
 from capsense.solver.surface_solver import PRESETS, Preset, SurfaceSolver
 from capsense.solver.tree import shape_cache as store
-from capsense.solver.tree.fine_panels import WIDE, WideBody, _ahead, wide_pieces
+from capsense.solver.tree.fine_panels import WIDE, FinePanelBody, _ahead, wide_pieces
 from capsense.solver.tree.rigid import (
     BODY,
     Clusters,
@@ -106,16 +106,16 @@ def test_impedances_of_wide_meshes_are_kept_in_files(tmp_path, monkeypatch):
     """Unit: another process reads what the first worked out; what is damaged is made again."""
     monkeypatch.setattr(store, "default_cache_dir", lambda: tmp_path)
     box = BLOCK.to_trimesh()
-    made: list[WideBody] = []
+    made: list[FinePanelBody] = []
     worked_out: list[int] = []
-    inside = WideBody._inside
-    monkeypatch.setattr(WideBody, "_inside", lambda self: worked_out.append(1) or inside(self))
+    inside = FinePanelBody._inside
+    monkeypatch.setattr(FinePanelBody, "_inside", lambda self: worked_out.append(1) or inside(self))
 
     def anew() -> np.ndarray:
         store._SHAPES.clear()
         shape = cs.TriMesh(box.vertices, box.faces)
         made.append(store.functions_of(shape, 700, conducting=False, largest=0.1)[0])
-        return made[-1].impedance
+        return made[-1].neumann_to_dirichlet
 
     first, second = anew(), anew()
     assert made[0] is not made[1]
@@ -306,7 +306,7 @@ def test_what_is_kept_of_a_shape():
     assert first.radius * size == pytest.approx(math.hypot(0.2, 0.15, 0.1), rel=0.1)
     assert first.radius * size >= math.hypot(0.2, 0.15, 0.1)
     panels = panels_of(cs.Box((0.4, 0.3, 0.2)), 5000)
-    assert WideBody(panels, lambda: panels).record["n"] == len(panels) == first.record["n"]
+    assert FinePanelBody(panels, lambda: panels).record["n"] == len(panels) == first.record["n"]
     assert first.nbytes > 8 * 2 * len(panels)
 
 
@@ -319,11 +319,18 @@ def test_which_bodies_are_wide(sim):
     small = cs.Box((0.3, 0.3, 0.008))
     top = table.to_trimesh()
     for shape, conducting, kind in (
-        (PLATE, True, WideBody), (PLATE, False, WideBody), (BLOCK, False, WideBody),
-        (mesh, True, WideBody), (mesh, False, WideBody), (cs.Sphere(0.05), True, RigidShape),
-        (table, False, WideBody), (cs.TriMesh(top.vertices, top.faces), False, WideBody),
-        (sheet, False, RigidShape), (lidless, True, WideBody), (small, False, RigidShape),
-    ):  # fmt: skip
+        (PLATE, True, FinePanelBody),
+        (PLATE, False, FinePanelBody),
+        (BLOCK, False, FinePanelBody),
+        (mesh, True, FinePanelBody),
+        (mesh, False, FinePanelBody),
+        (cs.Sphere(0.05), True, RigidShape),
+        (table, False, FinePanelBody),
+        (cs.TriMesh(top.vertices, top.faces), False, FinePanelBody),
+        (sheet, False, RigidShape),
+        (lidless, True, FinePanelBody),
+        (small, False, RigidShape),
+    ):
         found, _ = solver.functions_of(shape, conducting)
         assert isinstance(found, kind)
         assert found.record.dtype == BODY
@@ -344,7 +351,7 @@ def test_bodies_are_wide_for_narrow_electrodes(simulators, name, preset, wide):
     solver = SurfaceSolver(sim.background.green, sim.design, preset=PRESETS[preset])
     balls = {r: cs.Sphere(r / solver.length) for r in (0.03, 0.05, 0.07)}
     kinds = {r: type(solver.functions_of(ball, True)[0]) for r, ball in balls.items()}
-    assert [r for r, kind in kinds.items() if kind is WideBody] == wide
+    assert [r for r, kind in kinds.items() if kind is FinePanelBody] == wide
 
 
 @pytest.mark.parametrize(
@@ -398,10 +405,10 @@ def test_approach_to_narrow_electrodes(simulators, name):
 
 def _panel_sums(tree: Clusters, areas: np.ndarray, count: int) -> np.ndarray:
     """The first functions of a tree as charges of its panels, shape (count, n)."""
-    below: list[np.ndarray] = [np.array([])] * len(tree.kids)
+    below: list[np.ndarray] = [np.array([])] * len(tree.children)
     out = np.zeros((count, len(areas)))
-    for k in range(len(tree.kids) - 1, -1, -1):
-        a, b = tree.kids[k]
+    for k in range(len(tree.children) - 1, -1, -1):
+        a, b = tree.children[k]
         below[k] = np.array([tree.panel[k]]) if a < 0 else np.concatenate([below[a], below[b]])
         if a >= 0 and tree.function[k] < count:
             for part, sign in ((below[a], 1.0), (below[b], -1.0)):
@@ -415,8 +422,8 @@ def test_the_impedance_of_the_inside(few, many):
     """Differential: Z − 2F of few panels, and each of the many panels on the nearest of them."""
     shape = cs.Ellipsoid((0.2, 0.15, 0.15))
     coarse, panels = panels_of(shape, few), panels_of(shape, many)
-    body = WideBody(panels, lambda: coarse)
-    known = len(body.impedance)
+    body = FinePanelBody(panels, lambda: coarse)
+    known = len(body.neumann_to_dirichlet)
     assert known == min(len(coarse), len(panels))
     free = free_block(coarse)
     more = impedance(coarse, free) - 2.0 * free
@@ -428,7 +435,7 @@ def test_the_impedance_of_the_inside(few, many):
     on[np.arange(len(panels)), nearest] = 1.0
     charges = _panel_sums(tree, areas, known) @ on
     truth = charges @ more @ charges.T
-    found = body.impedance
+    found = body.neumann_to_dirichlet
     np.testing.assert_allclose(found[1:, 1:], truth[1:, 1:], atol=1e-5 * np.abs(truth).max())
 
 
@@ -442,9 +449,9 @@ def test_clusters_that_come_first():
     found = _ahead(tree, parts, count)
 
     def sets(clusters: Clusters) -> list[frozenset[int]]:
-        out: list[frozenset[int]] = [frozenset()] * len(clusters.kids)
+        out: list[frozenset[int]] = [frozenset()] * len(clusters.children)
         for k in range(len(out) - 1, -1, -1):
-            a, b = clusters.kids[k]
+            a, b = clusters.children[k]
             assert (a < 0) == (clusters.panel[k] >= 0)
             assert a < 0 or k < a == b - 1
             out[k] = frozenset([int(clusters.panel[k])]) if a < 0 else out[a] | out[b]
@@ -453,12 +460,12 @@ def test_clusters_that_come_first():
     old, new = sets(tree), sets(found)
     assert set(new) == set(old)
     assert len(new) == len(old)
-    functions = found.function[found.kids[:, 0] >= 0]
+    functions = found.function[found.children[:, 0] >= 0]
     assert sorted(functions) == list(range(1, len(panels)))
-    assert (found.function[found.kids[:, 0] < 0] < 0).all()
-    assert (functions == found.kids[found.kids[:, 0] >= 0, 1] // 2).all()
+    assert (found.function[found.children[:, 0] < 0] < 0).all()
+    assert (functions == found.children[found.children[:, 0] >= 0, 1] // 2).all()
     top = 2 * count - 1
-    last = [k for k in range(top) if not 0 <= found.kids[k, 0] < top]
+    last = [k for k in range(top) if not 0 <= found.children[k, 0] < top]
     assert len(last) == count
     split_up = set(range(top)) - set(last)
     sums = [parts[list(members)].sum() for members in new]
@@ -582,7 +589,7 @@ def test_weights_of_functions():
     energies."""
     for shape, bound in ((cs.Sphere(0.1), 0.08), (cs.Capsule(0.09, 0.5), 0.12), (PLATE, 0.3)):
         panels = panels_of(shape, 5000, merge=False)
-        body = WideBody(panels, panels_of)
+        body = FinePanelBody(panels, panels_of)
         density = body.weights / panels.areas
         few = panels_of(shape, 600)
         wanted = equilibrium(free_block(few)) / few.areas
@@ -592,7 +599,7 @@ def test_weights_of_functions():
         assert np.sqrt(np.average((ratio - 1) ** 2, weights=panels.areas)) < bound
 
 
-def means_of(body: WideBody) -> np.ndarray:
+def means_of(body: FinePanelBody) -> np.ndarray:
     """The table of means of 1/r within the first clusters [1/m], (t, t)."""
     count = int(body.record["top"])
     place = ctypes.cast(int(body.record["means"]), ctypes.POINTER(ctypes.c_float))
@@ -606,7 +613,7 @@ def test_means_of_large_clusters():
     """Analytic: 1/R of a ball. Differential: panels with energies, for a plate. Invariant: a
     cluster's are those of its parts, by their charges; energies are positive."""
     ball, plate = (
-        WideBody(panels_of(shape, 5000, merge=False), panels_of)
+        FinePanelBody(panels_of(shape, 5000, merge=False), panels_of)
         for shape in (cs.Sphere(0.1), PLATE)
     )
     few = free_block(panels_of(PLATE, 1000))
@@ -614,17 +621,17 @@ def test_means_of_large_clusters():
     assert means_of(plate)[0, 0] == pytest.approx(1 / equilibrium(few).sum(), rel=0.01)
     for body in (ball, plate):
         means = means_of(body)
-        kids, charge = (
+        children, charge = (
             np.ctypeslib.as_array(
                 ctypes.cast(int(body.record[name]), ctypes.POINTER(kind)), (2 * len(means),)
             )
-            for name, kind in (("kids", ctypes.c_int64), ("charge", ctypes.c_double))
+            for name, kind in (("children", ctypes.c_int64), ("charge", ctypes.c_double))
         )
         for k in range(0, 60, 7):
-            x, y = kids[2 * k : 2 * k + 2]
+            x, y = children[2 * k : 2 * k + 2]
             mixed = charge[x] * means[x] + charge[y] * means[y]
             np.testing.assert_allclose(charge[k] * means[k], mixed, rtol=1e-5)
-        last = np.flatnonzero(kids[: 2 * len(means) : 2] >= len(means))
+        last = np.flatnonzero(children[: 2 * len(means) : 2] >= len(means))
         assert np.linalg.eigvalsh(means[np.ix_(last, last)]).min() > 0
 
 

@@ -38,7 +38,7 @@ from capsense.field.soft import Soft, no_soft, pack_soft
 LEAST = 1e-3, 2e-3, 3e-3
 """Distances from near, middle and far sources [m] below which their potential grows no more. They
 lie deeper than that under the surfaces of the design."""
-SHORE = 0.01
+WALL_FADE_LENGTH = 0.01
 """Bodies fade out over this distance beyond the room, and behind the face of a flat design, over
 the domain's shortest side."""
 DEEP, STEEP = (2.3, 3.8), 4.0
@@ -156,7 +156,7 @@ class Space(NamedTuple):
 
     face: NDArray[Any]
     curvature: float
-    room: NDArray[Any]
+    active_bounds: NDArray[Any]
     extent: float
     cover: float
     validity: float
@@ -173,7 +173,7 @@ class Green(NamedTuple):
     """φ⁰ alone, from the last of these, shape (f, lead)."""
     grid: Grid
     """The same as a table over the domain, roughly."""
-    lead: int
+    phi_columns: int
     """Columns of φ⁰, padded."""
     terminals: int
     """How many of them are terminals."""
@@ -185,7 +185,7 @@ class Green(NamedTuple):
     """Corners of the design [m], shape (2, 3)."""
     blends: NDArray[Any]
     """Distances [m] from ``box`` between which a level gives way to the next one, shape (2, 2)."""
-    room: NDArray[Any]
+    active_bounds: NDArray[Any]
     """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
     extent: float
     """Shortest side of the domain [m]."""
@@ -232,7 +232,7 @@ def _packed(green: GreenFunction, design: Design) -> Green:
     margin = 0.0 if design.domain.open else MARGIN * extent
     room = design.domain.sight + margin * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
     terminals = green.near_phi.shape[1]
-    lead = 8 * -(-terminals // 8)
+    phi_columns = 8 * -(-terminals // 8)
 
     def level(name: str, least: float) -> Level:
         positions, phi, modes = (
@@ -240,29 +240,40 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         )
         sources = np.full((3, _padded(len(positions))), _AWAY, np.float32)
         sources[:, : len(positions)] = positions.T
-        table = np.zeros((_padded(len(phi)), _padded(lead + modes.shape[1])), np.float32)
+        table = np.zeros((_padded(len(phi)), _padded(phi_columns + modes.shape[1])), np.float32)
         table[: len(phi), :terminals] = phi
-        table[: len(phi), lead : lead + modes.shape[1]] = modes
+        table[: len(phi), phi_columns : phi_columns + modes.shape[1]] = modes
         return Level(sources, table, least)
 
     near, middle, far = map(level, LEVELS, LEAST)
-    score_table = np.ascontiguousarray(far.table[:, :lead])
+    score_table = np.ascontiguousarray(far.table[:, :phi_columns])
     limits = np.float32(green.floor), np.float32(far.least)
 
     def phi(points: NDArray[np.float64]) -> NDArray[np.float32]:
         columns = np.full((3, _padded(len(points))), _AWAY, np.float32)
         columns[:, : len(points)] = points.T
-        out = np.empty((lead, columns.shape[1]), np.float32)
+        out = np.empty((phi_columns, columns.shape[1]), np.float32)
         point_potentials(columns, far.sources, score_table, limits, out)
         return np.clip(out[:, : len(points)].T, 0.0, 1.0)
 
     gap, cover = pack_gap(green.gap, green.clearance, design), cover_of(design)
     space = Space(gap.face, gap.curvature, room, extent, cover, gap.validity, gap.soft.limit)
     return Green(
-        (near, middle, far), score_table, grid_over(np.asarray(green.box, float), walls, phi),
-        lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blends, float), room, extent, cover, gap, space,
-    )  # fmt: skip
+        (near, middle, far),
+        score_table,
+        grid_over(np.asarray(green.box, float), walls, phi),
+        phi_columns,
+        terminals,
+        len(design.electrodes),
+        float(green.floor),
+        np.asarray(green.box, float),
+        np.asarray(green.blends, float),
+        room,
+        extent,
+        cover,
+        gap,
+        space,
+    )
 
 
 def _padded(count: int) -> int:
@@ -362,7 +373,7 @@ def beyond(points, space, middle):
     out, depth = 0.0, math.inf
     for i in range(3):
         c = 0.5 * (points[0, i] + points[3, i])
-        off = max(space.room[0, i] - c, c - space.room[1, i], 0.0)
+        off = max(space.active_bounds[0, i] - c, c - space.active_bounds[1, i], 0.0)
         out += off * off
         middle[i] = c
     _put(middle, on_face(middle[0], middle[1], middle[2], space.curvature))
@@ -373,7 +384,7 @@ def beyond(points, space, middle):
         else:
             depth = min(depth, space.face[1, 2] - space.limit - c)
     deep = (depth / space.validity - DEEP[0]) / DEEP[1] if space.cover < 1.0 else 0.0
-    return smooth(max(math.sqrt(out) / (SHORE * space.extent), deep))
+    return smooth(max(math.sqrt(out) / (WALL_FADE_LENGTH * space.extent), deep))
 
 
 @kernel

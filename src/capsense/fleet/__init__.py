@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._thread_pool import OneAtATime
+from capsense._thread_pool import ForkSafeRLock
 from capsense._validate import as_whole, checked_frequency, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
@@ -130,7 +130,7 @@ class Fleet:
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self.table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
-        self._one, self._warned = OneAtATime(), False
+        self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):

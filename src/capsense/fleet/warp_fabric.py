@@ -90,7 +90,7 @@ def find_touching(
 ):  # fmt: skip
     """Enter the bodies, of whatever matter, that reach below the face, (b, v).
 
-    ``node`` and ``clusters`` are of ``WarpCut``, which would be more than a GPU takes.
+    ``node`` and ``clusters`` are of ``WarpActiveTree``, which would be more than a GPU takes.
     """
     b, v = wp.tid()
     e = v // near.sensors

@@ -20,7 +20,7 @@ from capsense.scene.shapes import Shape
 from capsense.solver.bodies.outline import CHANGING, write_triangles
 from capsense.solver.gap.gap_kernels import REACH
 from capsense.solver.gap.touch import Pressed
-from capsense.solver.tree.dynamic_surface import ChangingBody
+from capsense.solver.tree.dynamic_surface import DynamicBody
 from capsense.solver.tree.matter import Matter
 from capsense.solver.tree.near_triangles import Face, near_triangles
 from capsense.solver.tree.rigid import BODY, RigidShape
@@ -50,7 +50,7 @@ class PackedBodies:
     """Their places in the scene, shape (n,)."""
     matter: Matter
     """What they are made of and what ties them to ground."""
-    shapes: list[RigidShape | ChangingBody]
+    shapes: list[RigidShape | DynamicBody]
     """What the records point to."""
     offsets: Array
     """From the bodies' origins to those of the parts of them that are solved for [m], (n, 3)."""
@@ -70,7 +70,7 @@ class PackedBodies:
         face = Face(gap.face, green.box, film, gap.top, gap.top - gap.soft.limit)
         limits = 2.0 * gap.validity, REACH[1] * gap.validity
         for record, shape in zip(self.records, self.shapes, strict=True):
-            if not isinstance(shape, ChangingBody) or record["sheet"] != 0.0:
+            if not isinstance(shape, DynamicBody) or record["sheet"] != 0.0:
                 continue
             found = near_triangles(shape, record, face, *limits)
             if found is not None:
@@ -79,17 +79,17 @@ class PackedBodies:
 
 
 @dataclass(frozen=True, eq=False)
-class Laid:
+class BodyTemplate:
     """Records of bodies but for where they stand, which is all that changes at most steps."""
 
     places: list[int]
     """Body of each part,"""
-    found: list[tuple[RigidShape | ChangingBody, float]]
+    found: list[tuple[RigidShape | DynamicBody, float]]
     """Its functions and its size [m]: what the records follow from."""
     records: NDArray[np.void]
     matter: Matter
     """What the parts are made of."""
-    shapes: list[RigidShape | ChangingBody]
+    shapes: list[RigidShape | DynamicBody]
     everywhere: bool = False
     """Whether each body is solved for as a whole wherever it stands."""
 
@@ -107,17 +107,17 @@ class Laid:
         return self.records.tobytes()
 
 
-def laid_out(
+def make_template(
     whole: Matter,
     places: list[int],
-    found: list[tuple[RigidShape | ChangingBody, float]],
-) -> Laid:
+    found: list[tuple[RigidShape | DynamicBody, float]],
+) -> BodyTemplate:
     """Lay out parts of bodies that are made of ``whole``."""
     shapes, matter = [shape for shape, _ in found], whole.repeated(places)
     records = np.array([s.record for s in shapes], BODY)
     records["scale"] = [size for _, size in found]
     matter.write(records, shapes)
-    return Laid(places, found, records, matter, shapes)
+    return BodyTemplate(places, found, records, matter, shapes)
 
 
 def same(known: list[Shape], bodies: list[Shape]) -> bool:

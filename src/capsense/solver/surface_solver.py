@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.errors import CapSenseError, SceneError, SolveError
-from capsense.field.background import Change, Charges
+from capsense.field.background import CapacitanceChange, Charges
 from capsense.field.face import sheet_on_face
 from capsense.field.green import GreenFunction
-from capsense.field.green_kernels import SHORE, pack_green
+from capsense.field.green_kernels import WALL_FADE_LENGTH, pack_green
 from capsense.field.green_points import narrowest_width
 from capsense.field.panels import PLANE_TOL
 from capsense.scene import Body, Scene, TriMesh
@@ -28,7 +28,7 @@ from capsense.solver.bodies.panels import longer, windowed
 from capsense.solver.gap.gap_kernels import extent_of_body
 from capsense.solver.gap.touch import CoverContact, Pressed
 from capsense.solver.gap.touch_kernels import no_foundation
-from capsense.solver.packing import Laid, PackedBodies, View, laid_out, same
+from capsense.solver.packing import BodyTemplate, PackedBodies, View, make_template, same
 from capsense.solver.system.lossy import solve_lossy
 from capsense.solver.system.step import (
     DIFFERENCE,
@@ -38,7 +38,7 @@ from capsense.solver.system.step import (
     solve,
     solve_each,
 )
-from capsense.solver.tree.dynamic_surface import ChangingBody
+from capsense.solver.tree.dynamic_surface import DynamicBody
 from capsense.solver.tree.matter import UNIT, Matter, matter_of, sizes_of
 from capsense.solver.tree.rigid import BODY, RigidShape
 from capsense.solver.tree.shape_cache import functions_of
@@ -142,10 +142,12 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain, over ``length``, as :func:`windowed` takes them."""
-        self._sight = self.green.room + SHORE * self.green.extent * np.array([[-1.0], [1.0]])
+        self._sight = self.green.active_bounds + WALL_FADE_LENGTH * self.green.extent * np.array(
+            [[-1.0], [1.0]]
+        )
         """Corners of the box beyond which no charge is, over ``length``, shape (2, 3)."""
         self._last: tuple[View, Solution] | None = None
-        self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
+        self._laid: dict[tuple[Matter | Shape, ...], BodyTemplate] = {}
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         gap = self.green.gap
         self.touch = self.length * (gap.least if len(gap.areas) else TOUCH)
@@ -179,7 +181,9 @@ class SurfaceSolver:
         """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
         return self.__dict__ | {"_laid": {}}
 
-    def solve(self, scene: Scene, *, jacobian: bool = False, time: float | None = None) -> Change:
+    def solve(
+        self, scene: Scene, *, jacobian: bool = False, time: float | None = None
+    ) -> CapacitanceChange:
         """Return what a scene changes; ``time`` [s] is what a cover's relaxation follows.
 
         Raises:
@@ -203,7 +207,7 @@ class SurfaceSolver:
         if solution.shift > 0.0:
             return "bodies lie within each other or within the sensor"
         close = f"nearer than {2e3 * self.length * self.green.gap.validity:.2g} mm"
-        if (solution.near & (bodies.records["softness"] != 0.0)).any():
+        if (solution.near & (bodies.records["inverse_susceptibility"] != 0.0)).any():
             return f"what a dielectric adds that is {close} is only estimated there"
         if solution.near.any():
             return f"a conductor is {close}, and its panels are coarse for that"
@@ -211,19 +215,19 @@ class SurfaceSolver:
 
     def _change(
         self, view: View, bodies: PackedBodies, matrix: NDArray[Any], error: float, size: int
-    ) -> Change:
+    ) -> CapacitanceChange:
         """What a scene changes, by its matrix [F] and the error of that."""
         if self._meets_electrodes(view):
             error = math.inf
         loss = -matrix.imag if np.iscomplexobj(matrix) else None
-        return Change(matrix.real, error, unknowns=size, loss=loss, touch=bodies.touch)
+        return CapacitanceChange(matrix.real, error, unknowns=size, loss=loss, touch=bodies.touch)
 
-    def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]:
+    def solve_each(self, scenes: Sequence[Scene]) -> list[CapacitanceChange | CapSenseError]:
         """Return what each of many scenes changes, or what was wrong with it.
 
         Results are those of :meth:`solve`; those without losses are solved in one call.
         """
-        out: dict[int, Change | CapSenseError] = {}
+        out: dict[int, CapacitanceChange | CapSenseError] = {}
         plain: list[tuple[int, View, PackedBodies]] = []
         for k, scene in enumerate(scenes):
             try:
@@ -326,7 +330,7 @@ class SurfaceSolver:
             if matter.lossy:
                 out = solve_lossy(
                     bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)),
-                    matter.softness, self.green, preset.threshold, preset.width,
+                    matter.inverse_susceptibility, self.green, preset.threshold, preset.width,
                 )  # fmt: skip
             else:
                 out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
@@ -426,13 +430,13 @@ class SurfaceSolver:
         return replace(out, touch=touch, pressed=pressed)
 
     def _lay_out(
-        self, view: View, matter: Matter, bodies: list[Shape], laid: Laid | None
-    ) -> tuple[Laid, list[tuple[int, Array]]]:
+        self, view: View, matter: Matter, bodies: list[Shape], laid: BodyTemplate | None
+    ) -> tuple[BodyTemplate, list[tuple[int, Array]]]:
         """Records of the bodies, and where parts of them stand in their frames [m], if not at 0.
 
         ``laid`` is what was found of them when they stood elsewhere.
         """
-        found: list[tuple[RigidShape | ChangingBody, float]] = []
+        found: list[tuple[RigidShape | DynamicBody, float]] = []
         solved: list[Shape] = []
         places: list[int] = []
         offsets: list[tuple[int, Array]] = []
@@ -446,7 +450,7 @@ class SurfaceSolver:
                 solved.append(part)
                 places.append(place)
         if laid is None or (laid.places, laid.found) != (places, found):
-            laid = laid_out(matter, places, found)
+            laid = make_template(matter, places, found)
         whole = [body.measured_in(self.length) for body in bodies]
         return replace(laid, everywhere=same(solved, whole)), offsets
 
@@ -499,7 +503,7 @@ class SurfaceSolver:
 
     def functions_of(
         self, shape: Shape, conducting: bool, share: float = 1.0
-    ) -> tuple[RigidShape | ChangingBody, float]:
+    ) -> tuple[RigidShape | DynamicBody, float]:
         """Charge functions of a body from a share of the usual panels, and its size; its lengths
         are over ``length``."""
         panels = round(share * self.preset.panels)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 _BEND = 0.5
 """How far the points on touching panels crowd towards edges, where the other's potential bends."""
-_BARRIER = 1e6
+_WALL_PENALTY = 1e6
 """Impedance between unconnected parts of a body, over the mean of the diagonal."""
 _LEAST_RATE = 1e-3
 """Least rate (of at most 4π) at which a pattern of charge is let through the inside."""
@@ -100,7 +100,7 @@ def impedance(panels: SurfacePanels, free: Array) -> Array:
     total = charge.sum(axis=1)
     crossing = inside - np.outer(np.ones(len(panels)), inside.T @ total / total.sum())
     if inside.shape[1] > 1:
-        z += _BARRIER * float(np.diag(z).mean()) * (crossing @ crossing.T)
+        z += _WALL_PENALTY * float(np.diag(z).mean()) * (crossing @ crossing.T)
     return z
 
 

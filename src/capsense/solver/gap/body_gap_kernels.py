@@ -119,7 +119,7 @@ def mark(facing, near):
 @kernel
 def _is_free(body):
     """Whether a conductor is not at ground."""
-    return _conducts(body) and (body.neutral != 0 or body.tie > 0.0)
+    return _conducts(body) and (body.neutral != 0 or body.ground_elastance > 0.0)
 
 
 @kernel
@@ -128,7 +128,11 @@ def _conducts(body):
 
     Of a surface that changes, the outline is only what is near the design.
     """
-    return body.outline not in (0, CHANGING) and body.softness == 0.0 and body.stiffer == 0.0
+    return (
+        body.outline not in (0, CHANGING)
+        and body.inverse_susceptibility == 0.0
+        and body.polarization_stiffness == 0.0
+    )
 
 
 @kernel
@@ -186,12 +190,12 @@ def _extent(body):
 @kernel
 def _panel_size(body):
     """Mean extent of a body's panels, by area, from some of them [m]."""
-    kids, extent = integers(body.kids), doubles(body.extent)
+    children, extent = integers(body.children), doubles(body.extent)
     total = area = 0.0
     count = 2 * body.n - 1
     stride = max(1, count // _SAMPLES)
     for k in range(count - 1, -1, -stride):
-        if kids[2 * k] < 0:
+        if children[2 * k] < 0:
             e = extent[k]
             total += e * e * e
             area += e * e

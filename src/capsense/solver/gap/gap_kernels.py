@@ -49,13 +49,16 @@ def near_bodies(bodies, green, dielectric=False):
         return out
     for b in range(bodies.shape[0]):
         body = bodies[b]
-        if body.outline == 0 or (body.softness != 0.0) != dielectric:
+        if body.outline == 0 or (body.inverse_susceptibility != 0.0) != dielectric:
             continue
         if body.outline == CHANGING:  # it has this outline only where it is near
             out[b] = True
         else:
             low, reach = middle_height(body), reach_down(body)
-            around = low - reach <= green.room[0, 2] and low + reach >= green.room[1, 2]
+            around = (
+                low - reach <= green.active_bounds[0, 2]
+                and low + reach >= green.active_bounds[1, 2]
+            )
             middle, lowest, _ = stand_of(body, gap)
             out[b] = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and not around
     return out

@@ -45,13 +45,13 @@ def jacobian(solution, bodies, green):
         parallel to these through the body's position [m/rad].
     """
     charge, points = solution.charge, solution.points
-    lead, m, count = charge.shape[1], green.terminals, bodies.shape[0]
+    phi_columns, m, count = charge.shape[1], green.terminals, bodies.shape[0]
     bounds = np.zeros(count + 1, np.int64)
     for j in range(points.shape[0]):
         bounds[solution.owner[j] + 1] = j + 1
     for b in range(count):
         bounds[b + 1] = max(bounds[b], bounds[b + 1])
-    work = np.zeros((count, 6, lead, lead), np.float32)
+    work = np.zeros((count, 6, phi_columns, phi_columns), np.float32)
     _add_design(points, charge, bounds, green, work)
     _add_pairs(solution, bounds, green.floor, work)
     out = np.empty((count, m, m, 6))
@@ -72,9 +72,9 @@ def jacobian(solution, bodies, green):
 @compiled
 def _add_design(points, charge, bounds, green, work):
     """Add forces and torques by the design's sources, (b, 6, lead, lead)."""
-    n, lead, floor = points.shape[0], charge.shape[1], green.floor
+    n, phi_columns, floor = points.shape[0], charge.shape[1], green.floor
     distance, share = distances(points, green), np.empty(n)
-    modes = np.zeros((lead, green.levels[0].table.shape[1]), np.float32)
+    modes = np.zeros((phi_columns, green.levels[0].table.shape[1]), np.float32)
     sums = [np.empty((0, 0, 0, 0), np.float32) for _ in green.levels]
     for k in range(len(green.levels)):
         level = green.levels[k]
@@ -82,10 +82,10 @@ def _add_design(points, charge, bounds, green, work):
             share[j] = level_share(distance[j], k, green.blends)
         sums[k] = _source_sums(points, charge, share, bounds, level, floor)
         _add_modes(sums[k], level.table, modes)
-    right = np.zeros((modes.shape[1], lead), np.float32)
-    for i in range(lead):
+    right = np.zeros((modes.shape[1], phi_columns), np.float32)
+    for i in range(phi_columns):
         right[i, i] = 1.0
-        for k in range(lead, modes.shape[1]):
+        for k in range(phi_columns, modes.shape[1]):
             right[k, i] = modes[i, k]
     for k in range(len(green.levels)):
         _add_work(sums[k], green.levels[k].sources, green.levels[k].table, right, work)
@@ -101,24 +101,24 @@ def _source_sums(points, charge, share, bounds, level, floor):
         above zero.
     """
     sources, floor, least = level.sources, np.float32(floor), np.float32(level.least)
-    count, lead, width = bounds.shape[0] - 1, charge.shape[1], sources.shape[1]
+    count, phi_columns, width = bounds.shape[0] - 1, charge.shape[1], sources.shape[1]
     some_count = 0
     for j in range(points.shape[0]):
         some_count += share[j] > 0.0
     if some_count == 0:
-        return np.zeros((0, 6, lead, width), np.float32)
-    out = np.zeros((count, 6, lead, width), np.float32)
+        return np.zeros((0, 6, phi_columns, width), np.float32)
+    out = np.zeros((count, 6, phi_columns, width), np.float32)
     some = np.empty((_BLOCK, 4, 3), np.float32)
     lines = np.empty((6, _BLOCK, width), np.float32)
-    sums = np.empty((lead, width), np.float32)
+    sums = np.empty((phi_columns, width), np.float32)
     for b in range(count):
         j = bounds[b]
         while j < bounds[b + 1]:
             chosen = 0
-            left = np.zeros((lead, _BLOCK), np.float32)
+            left = np.zeros((phi_columns, _BLOCK), np.float32)
             while j < bounds[b + 1] and chosen < _BLOCK:
                 if share[j] > 0.0:
-                    for i in range(lead):
+                    for i in range(phi_columns):
                         left[i, chosen] = 0.25 * share[j] * charge[j, i]
                     for q in range(4):
                         for i in range(3):
@@ -154,13 +154,13 @@ def _add_modes(sums, table, modes):
     """Add the sums of ψ over all charges to ``modes`` (lead, w); those of φ⁰ mean nothing."""
     if sums.shape[0] == 0:
         return
-    lead, s = sums.shape[2], table.shape[0]
-    whole = np.zeros((lead, s), np.float32)
+    phi_columns, s = sums.shape[2], table.shape[0]
+    whole = np.zeros((phi_columns, s), np.float32)
     for b in range(sums.shape[0]):
-        for i in range(lead):
+        for i in range(phi_columns):
             for k in range(s):
                 whole[i, k] += sums[b, 0, i, k]
-    part = np.empty((lead, table.shape[1]), np.float32)
+    part = np.empty((phi_columns, table.shape[1]), np.float32)
     multiply(whole, table, part)
     _add(part, modes[:, : table.shape[1]])
 
@@ -168,14 +168,14 @@ def _add_modes(sums, table, modes):
 @compiled
 def _add_work(sums, sources, table, right, work):
     """Add forces and torques by sources of coefficients ``table @ right``, shape (s, lead)."""
-    count, lead, width = sums.shape[0], sums.shape[2], sums.shape[3]
+    count, phi_columns, width = sums.shape[0], sums.shape[2], sums.shape[3]
     if count == 0:
         return
-    coefficients = np.empty((width, lead), np.float32)
+    coefficients = np.empty((width, phi_columns), np.float32)
     multiply_simd(table, right[: table.shape[1]], coefficients)
     for b in range(count):
         own = sums[b]
-        for i in range(lead):
+        for i in range(phi_columns):
             for k in range(width):
                 x, y = sources[0, k], sources[1, k]
                 fx, fy, fz = own[1, i, k], own[2, i, k], own[3, i, k]
@@ -189,18 +189,18 @@ def _add_work(sums, sources, table, right, work):
 @compiled
 def _add_contracted(sums, coefficients, work):
     """``work += sums @ coefficients``, shapes (6, lead, lead), (6, lead, s) and (s, lead)."""
-    lead, width = sums.shape[1], sums.shape[2]
-    part = np.empty((6 * lead, lead), np.float32)
-    multiply_simd(sums.reshape((6 * lead, width)), coefficients, part)
-    _add(part, work.reshape((6 * lead, lead)))
+    phi_columns, width = sums.shape[1], sums.shape[2]
+    part = np.empty((6 * phi_columns, phi_columns), np.float32)
+    multiply_simd(sums.reshape((6 * phi_columns, width)), coefficients, part)
+    _add(part, work.reshape((6 * phi_columns, phi_columns)))
 
 
 @compiled
 def _add_pairs(solution, bounds, floor, work):
     """Add forces and torques by other bodies' charges and by all images in the floor."""
     charge, points = solution.charge, solution.points
-    extent, soft = solution.extent, solution.soft
-    n, lead = charge.shape
+    extent, soft = solution.extent, solution.softening_length
+    n, phi_columns = charge.shape
     image = np.empty((n, 4, 3))
     for j in range(n):
         for q in range(4):
@@ -208,18 +208,18 @@ def _add_pairs(solution, bounds, floor, work):
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
     width = shapes.shape[1]
-    coefficients = np.zeros((width, lead), np.float32)
+    coefficients = np.zeros((width, phi_columns), np.float32)
     for j in range(n):
-        for i in range(lead):
+        for i in range(phi_columns):
             coefficients[j, i] = charge[j, i]
     weight, near = np.empty(width, np.float32), np.empty((14, width), np.float32)
-    sums = np.empty((6, lead, width), np.float32)
+    sums = np.empty((6, phi_columns, width), np.float32)
     for b in range(work.shape[0]):
         start, stop = bounds[b], bounds[b + 1]
         lines = np.zeros((6, stop - start, width), np.float32)
-        left = np.empty((lead, stop - start), np.float32)
+        left = np.empty((phi_columns, stop - start), np.float32)
         for i in range(start, stop):
-            for k in range(lead):
+            for k in range(phi_columns):
                 left[k, i - start] = charge[i, k]
             _weigh(shapes, i, mirrored, n, 1.0, weight)
             pair_line(shapes, i, mirrored, weight, lines, i - start)

@@ -32,7 +32,7 @@ from capsense.solver.tree.mean_kernels import (
     rectangles,
 )
 
-BARRIER = 1e5
+WALL_PENALTY = 1e5
 """Energy of charge that is out of reach [1/m]."""
 LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
@@ -52,7 +52,12 @@ def leaf_pairs(leaves, floor):
     Returns:
         Shape (l, l) [1/m].
     """
-    points, extent, owner, soft = leaves.points, leaves.extent, leaves.owner, leaves.soft
+    points, extent, owner, soft = (
+        leaves.points,
+        leaves.extent,
+        leaves.owner,
+        leaves.softening_length,
+    )
     n = points.shape[0]
     out = np.zeros((n, n), np.float32)
     image = np.empty((n, 4, 3))
@@ -74,13 +79,16 @@ def leaf_pairs(leaves, floor):
             if far_means(shapes, i, shapes, behind, line):
                 _near_means(flat, i, flat, behind, line, room)
             add_line(line, 1.0, (np.int64(0), behind), out, i)
-        out[i, i] += BARRIER * leaves.beyond[i] ** 3
-    tables, start = (shapes, rectangles(points, leaves.within), leaves.known), np.int64(0)
+        out[i, i] += WALL_PENALTY * leaves.outside_fraction[i] ** 3
+    tables, start = (
+        (shapes, rectangles(points, leaves.self_interaction_weight), leaves.table_rows),
+        np.int64(0),
+    )
     for i in range(n):
         if i + 1 == n or owner[i + 1] != owner[i]:
-            if leaves.within[i] > 0.0:
+            if leaves.self_interaction_weight[i] > 0.0:
                 body = start, start, i + 1, leaves.size[i]
-                add_means(points, extent, body, leaves.within, tables, out)
+                add_means(points, extent, body, leaves.self_interaction_weight, tables, out)
             start = i + 1
     _add_lifted(leaves, flat, line, room, out)
     mirror(out)
@@ -104,11 +112,11 @@ def _add_lifted(leaves, flat, line, room, out):
         for q in range(4):
             for k in range(3):
                 if abs(points[i, q, k] - true[i, q, k]) > LIFTED:
-                    lifted[i] = leaves.within[i] == 0.0
+                    lifted[i] = leaves.self_interaction_weight[i] == 0.0
         some = some or lifted[i]
     if not some:
         return
-    before, unlifted = _flat(true, leaves.soft), np.empty(line.shape[0], np.float32)
+    before, unlifted = _flat(true, leaves.softening_length), np.empty(line.shape[0], np.float32)
     for i in range(n):
         for j in range(i):
             wanted = owner[i] == owner[j] and (lifted[i] or lifted[j])
@@ -149,7 +157,7 @@ def bound_images(leaves, rows, pairs, green):
         if inverse * side < _WIDE or lowest < 0.0:
             continue
         met = mean_inverse(points[j], image, 0.0)
-        for k in range(green.lead, rows.shape[1]):
+        for k in range(green.phi_columns, rows.shape[1]):
             met += float(rows[j, k]) ** 2
         extra = met - _mirror_mean(2.0 / (inverse * side)) / side
         pairs[j, j] += max(0.0, extra) * smooth(10.0 * extra / met)

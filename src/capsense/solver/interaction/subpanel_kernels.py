@@ -22,12 +22,12 @@ def add_parts(bodies, cut, leaves, out):
         leaves: Those that are represented by themselves.
         out: Added to [1/m], shape (l, l).
     """
-    n = cut.leaves.shape[0]
+    n = cut.active.shape[0]
     # first leaf of the body, and the first one that is a part; literals would be types of their own
     start, first = np.int64(0), np.int64(-1)
     for i in range(n):
         body = bodies[leaves.owner[i]]
-        if first < 0 and cut.node[cut.leaves[i]] >= body.stored:
+        if first < 0 and cut.node[cut.active[i]] >= body.n_panel_clusters:
             first = i
         if i + 1 == n or leaves.owner[i + 1] != leaves.owner[i]:
             if first >= 0:
@@ -39,7 +39,7 @@ def add_parts(bodies, cut, leaves, out):
 def _add_of_body(body, cut, leaves, span, out):
     """The same of the leaves of one body: its first, the first that is a part, the one behind."""
     start, first, stop = span
-    factor = np.float32(1.0 + body.inside * body.softness)
+    factor = np.float32(1.0 + body.inside * body.inverse_susceptibility)
     group, weight, groups = _panels(body, cut, (first, stop))
     n = stop - start
     points, extent = leaves.true[start:stop], leaves.extent[start:stop]
@@ -76,7 +76,7 @@ def _panels(body, cut, span):
     """
     first, stop = span
     group, weight = np.empty(stop - first, np.int64), np.empty(stop - first)
-    begin = end = cut.leaves[stop - 1]
+    begin = end = cut.active[stop - 1]
     while begin > 0 and cut.body[begin - 1] == cut.body[end]:
         begin -= 1
     while end < cut.body.shape[0] and cut.body[end] == cut.body[begin]:
@@ -84,24 +84,26 @@ def _panels(body, cut, span):
     number, share = np.empty(end - begin, np.int64), np.empty(end - begin)
     count = 0
     for a in range(begin, end):
-        if cut.node[a] < body.stored:
+        if cut.node[a] < body.n_panel_clusters:
             number[a - begin], share[a - begin] = -1, 1.0
         for c in range(2):
-            x = cut.kids[a, c]
-            if x >= 0 and cut.node[x] >= body.stored:
+            x = cut.children[a, c]
+            if x >= 0 and cut.node[x] >= body.n_panel_clusters:
                 if number[a - begin] < 0:
                     number[a - begin] = count
                     count += 1
                 number[x - begin] = number[a - begin]
-                part = cut.parts[a, c]
-                if part == 0.0 and cut.node[a] < body.stored:  # they hardly stand for it yet
-                    part = cut.share[a] if c == 0 else 1.0 - cut.share[a]
+                part = cut.child_weights[a, c]
+                if (
+                    part == 0.0 and cut.node[a] < body.n_panel_clusters
+                ):  # they hardly stand for it yet
+                    part = cut.charge_fraction[a] if c == 0 else 1.0 - cut.charge_fraction[a]
                 share[x - begin] = share[a - begin] * part
     whole = np.zeros(count)
     for j in range(first, stop):
-        a = cut.leaves[j]
+        a = cut.active[j]
         group[j - first] = number[a - begin]
-        weight[j - first] = share[a - begin] * cut.whole[a]
+        weight[j - first] = share[a - begin] * cut.self_weight[a]
         whole[group[j - first]] += weight[j - first]
     for j in range(stop - first):
         weight[j] /= whole[group[j]]

@@ -1,8 +1,8 @@
 """The step, compiled: the clusters that are not split further, and what the design does to them
 and to their charges: means of potentials, and forces.
 
-A *row* is a cluster's mean of the terminals' potentials φ⁰ (first ``Green.lead`` columns) and of
-the modes ψ of g.
+A *row* is a cluster's mean of the terminals' potentials φ⁰ (first ``Green.phi_columns`` columns)
+and of the modes ψ of g.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from capsense.field.green_kernels import (
     level_share,
     source_potentials,
 )
-from capsense.solver.tree.mean_kernels import extent_of, four_points
+from capsense.solver.tree.mean_kernels import extent_of, quadrature4
 
 
-class Leaves(NamedTuple):
-    """The clusters that are represented by themselves, see :class:`Cut`."""
+class ActiveClusters(NamedTuple):
+    """The clusters that are represented by themselves, see :class:`ActiveTree`."""
 
     points: NDArray[Any]
     """Four points of each [m], shape (l, 4, 3)."""
@@ -49,16 +49,16 @@ class Leaves(NamedTuple):
     """The same before they were lifted off the design."""
     extent: NDArray[Any]
     """Extents [m], shape (l,)."""
-    soft: NDArray[Any]
+    softening_length: NDArray[Any]
     """Distances below which 1/r from their points is bounded [m], shape (l,)."""
-    beyond: NDArray[Any]
+    outside_fraction: NDArray[Any]
     """How far each is out of reach, 0 to 1, see ``green_kernels.beyond``, shape (l,)."""
     owner: NDArray[Any]
     """Body of each, ascending, shape (l,)."""
-    within: NDArray[Any]
+    self_interaction_weight: NDArray[Any]
     """How much clusters of a body meet each other, 1 for a conductor; 0 for those of a body that
     has energies of its own; shape (l,)."""
-    known: NDArray[Any]
+    table_rows: NDArray[Any]
     """Rows in a table of means of 1/r within a body, -1 for none, and where it stands, (l, 2)."""
     size: NDArray[Any]
     """How many times as large as in such a table the body of each is, shape (l,)."""
@@ -67,8 +67,8 @@ class Leaves(NamedTuple):
 @compiled
 def placed(bodies, cut, green):
     """Place the leaves of a cut in the sensor frame."""
-    n = cut.leaves.shape[0]
-    leaves = Leaves(
+    n = cut.active.shape[0]
+    leaves = ActiveClusters(
         np.empty((n, 4, 3)), np.empty((n, 4, 3)), np.empty(n), np.empty(n), np.empty(n),
         np.empty(n, np.int64), np.zeros(n), np.full((n, 2), -1), np.empty(n),
     )  # fmt: skip
@@ -81,29 +81,29 @@ def _fill_leaves(bodies, cut, green, leaves, room):
     """The same; ``room`` is room to work in: two matrices and a vector of three."""
     moments, turn, middle = room
     space = green.space
-    for j in range(cut.leaves.shape[0]):
-        a, corners, points = cut.leaves[j], leaves.true[j], leaves.points[j]
+    for j in range(cut.active.shape[0]):
+        a, corners, points = cut.active[j], leaves.true[j], leaves.points[j]
         body, k = bodies[cut.body[a]], cut.node[a]
         leaves.owner[j], leaves.size[j] = cut.body[a], body.scale
         if k < body.top:
-            leaves.known[j, 0], leaves.known[j, 1] = k, body.means
-        if body.energy == 0:  # clusters meet each other at every step
-            leaves.within[j] = 1.0 + body.inside * body.softness
+            leaves.table_rows[j, 0], leaves.table_rows[j, 1] = k, body.means
+        if body.potential_coefficients == 0:  # clusters meet each other at every step
+            leaves.self_interaction_weight[j] = 1.0 + body.inside * body.inverse_susceptibility
         if body.points == 0:
             spread, center = doubles(body.spread), doubles(body.center)
             for i in range(3):
                 middle[i] = center[3 * k + i]
                 for q in range(3):
                     moments[i, q] = spread[9 * k + 3 * i + q]
-            extent, soft = four_points(moments, middle, turn, corners)
+            extent, soft = quadrature4(moments, middle, turn, corners)
         else:
-            local, soft = doubles(body.points), doubles(body.soft)[k]
+            local, soft = doubles(body.points), doubles(body.softening_length)[k]
             for q in range(4):
                 for i in range(3):
                     corners[q, i] = local[12 * k + 3 * q + i]
             extent = extent_of(corners)
         extent *= body.scale
-        leaves.extent[j], leaves.soft[j] = extent, body.scale * soft
+        leaves.extent[j], leaves.softening_length[j] = extent, body.scale * soft
         for q in range(4):
             for i in range(3):
                 points[q, i] = body.position[i] + body.scale * (
@@ -112,7 +112,7 @@ def _fill_leaves(bodies, cut, green, leaves, room):
         for q in range(4):
             for i in range(3):
                 corners[q, i] = points[q, i]  # before it is lifted
-        leaves.beyond[j] = beyond(points, space, middle)
+        leaves.outside_fraction[j] = beyond(points, space, middle)
         if space.cover < 1.0:
             keep_off(points, space)
 

@@ -15,20 +15,20 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import integers, singles
-from capsense.solver.placement.placement_kernels import Leaves
-from capsense.solver.selection.selection_kernels import Cut, is_there
+from capsense.solver.placement.placement_kernels import ActiveClusters
+from capsense.solver.selection.selection_kernels import ActiveTree, is_there
 
 _SAME = 1e-9
 """Shares that differ by less than this are the same."""
 
 
 @compiled
-def reached(cut, leaves):
+def truncate_to_domain(cut, leaves):
     """Return a cut and its leaves without the clusters that are out of reach."""
-    n, count = cut.leaves.shape[0], cut.node.shape[0]
+    n, count = cut.active.shape[0], cut.node.shape[0]
     out = False
     for j in range(n):
-        out = out or leaves.beyond[j] > 0.0
+        out = out or leaves.outside_fraction[j] > 0.0
     if not out:
         return cut, leaves
     inside, there = np.zeros(count), np.zeros(count)
@@ -36,15 +36,15 @@ def reached(cut, leaves):
     kept = 0
     for a in range(count - 1, -1, -1):
         leaf[a] = -1
-        if cut.leaf[a] >= 0:
-            whole[a] = cut.whole[a] * (1.0 - leaves.beyond[cut.leaf[a]])
+        if cut.active_index[a] >= 0:
+            whole[a] = cut.self_weight[a] * (1.0 - leaves.outside_fraction[cut.active_index[a]])
             if whole[a] > 0.0:
-                there[a] = cut.whole[a]
+                there[a] = cut.self_weight[a]
                 kept += 1
         for c in range(2):
-            if cut.kids[a, c] >= 0:
-                parts[a, c] = cut.parts[a, c] * inside[cut.kids[a, c]]
-                below = (1.0 - cut.whole[a]) * there[cut.kids[a, c]]
+            if cut.children[a, c] >= 0:
+                parts[a, c] = cut.child_weights[a, c] * inside[cut.children[a, c]]
+                below = (1.0 - cut.self_weight[a]) * there[cut.children[a, c]]
                 there[a] = max(there[a], below)
         inside[a] = whole[a] + parts[a, 0] + parts[a, 1]
         if inside[a] > 0.0:
@@ -57,30 +57,46 @@ def reached(cut, leaves):
     known, size = np.empty((kept, 2), np.int64), np.empty(kept)
     i = 0
     for j in range(n):
-        a = cut.leaves[j]
+        a = cut.active[j]
         if whole[a] > 0.0:
             leaf[a], at[i] = i, a
             for q in range(4):
                 for k in range(3):  # copies of whole arrays would bring in code for texts of errors
                     points[i, q, k], true[i, q, k] = leaves.points[j, q, k], leaves.true[j, q, k]
-            extent[i], soft[i], beyond[i] = leaves.extent[j], leaves.soft[j], leaves.beyond[j]
-            owner[i], within[i] = leaves.owner[j], leaves.within[j]
-            known[i, 0], known[i, 1] = leaves.known[j, 0], leaves.known[j, 1]
+            extent[i], soft[i], beyond[i] = (
+                leaves.extent[j],
+                leaves.softening_length[j],
+                leaves.outside_fraction[j],
+            )
+            owner[i], within[i] = leaves.owner[j], leaves.self_interaction_weight[j]
+            known[i, 0], known[i, 1] = leaves.table_rows[j, 0], leaves.table_rows[j, 1]
             size[i] = leaves.size[j]
             i += 1
     return (
-        Cut(
-            cut.body, cut.node, cut.kids, cut.share, parts, leaf, whole, cut.fade, cut.above,
-            there, at,
+        ActiveTree(
+            cut.body,
+            cut.node,
+            cut.children,
+            cut.charge_fraction,
+            parts,
+            leaf,
+            whole,
+            cut.fade,
+            cut.parent_fade,
+            there,
+            at,
         ),
-        Leaves(points, true, extent, soft, beyond, owner, within, known, size),
-    )  # fmt: skip
+        ActiveClusters(points, true, extent, soft, beyond, owner, within, known, size),
+    )
 
 
 @kernel
 def _moved(cut, a):
     """How much of f_A is in the charge of cluster A that is within reach."""
-    return cut.parts[a, 0] * (1.0 - cut.share[a]) - cut.parts[a, 1] * cut.share[a]
+    return (
+        cut.child_weights[a, 0] * (1.0 - cut.charge_fraction[a])
+        - cut.child_weights[a, 1] * cut.charge_fraction[a]
+    )
 
 
 @compiled
@@ -102,30 +118,30 @@ def add_own(bodies, cut, functions, inside, matrix, rest, own):
     while first < cut.node.shape[0]:
         b, last, moved = cut.body[first], first, False
         while last < cut.node.shape[0] and cut.body[last] == b:
-            moved = moved or (cut.kids[last, 0] >= 0 and abs(_moved(cut, last)) > _SAME)
+            moved = moved or (cut.children[last, 0] >= 0 and abs(_moved(cut, last)) > _SAME)
             last += 1
         body = bodies[b]
-        address = body.impedance if inside else body.energy
+        address = body.neumann_to_dirichlet if inside else body.potential_coefficients
         if address != 0:
             count = 0
             for f in range(total):
                 if functions.body[f] == b:
                     of[count] = f
                     count += 1
-            factor = (body.softness if inside else 1.0) / body.scale
+            factor = (body.inverse_susceptibility if inside else 1.0) / body.scale
             table = singles(address)
             block = np.empty((0, 0))
             if moved:
                 block = _own_block(body, table, inside, cut, (first, last), functions, of[:count])
             for i in range(count):
-                f, line = of[i], functions.number[of[i]] * body.known
+                f, line = of[i], functions.number[of[i]] * body.n_tabulated
                 for j in range(i + 1):
                     e = of[j]
                     if f != e and e >= solved:
                         continue
                     if moved:
                         value = block[i, j]
-                    elif max(functions.number[f], functions.number[e]) >= body.known or (
+                    elif max(functions.number[f], functions.number[e]) >= body.n_tabulated or (
                         inside and functions.number[f] * functions.number[e] == 0
                     ):
                         value = 0.0
@@ -152,14 +168,14 @@ def _own_block(body, table, inside, cut, span, functions, of):
     number, index = np.zeros(clusters + 1, np.int64), np.zeros(clusters, np.int64)
     count = 1  # the net charge comes first
     for a in range(first, last):
-        if cut.kids[a, 0] >= 0 and is_there(cut, a):
+        if cut.children[a, 0] >= 0 and is_there(cut, a):
             number[count], index[a - first] = integers(body.function)[cut.node[a]], count
             count += 1
     rows = np.zeros((count, count))
     for i in range(1 if inside else 0, count):
         for j in range(1 if inside else 0, i + 1):
-            if number[i] < body.known and number[j] < body.known:
-                rows[i, j] = rows[j, i] = table[number[i] * body.known + number[j]]
+            if number[i] < body.n_tabulated and number[j] < body.n_tabulated:
+                rows[i, j] = rows[j, i] = table[number[i] * body.n_tabulated + number[j]]
     half = _within_reach(cut, span, index, functions, of, rows)
     return _within_reach(cut, span, index, functions, of, half.T.copy())
 
@@ -172,7 +188,7 @@ def _within_reach(cut, span, index, functions, of, rows):
     more, out = np.zeros((last - first, width)), np.empty((of.shape[0], width))
     changed = np.zeros(last - first, np.bool_)  # else a line of ``more`` is zero
     for a in range(last - 1, first - 1, -1):
-        if cut.kids[a, 0] < 0 or not is_there(cut, a):
+        if cut.children[a, 0] < 0 or not is_there(cut, a):
             continue
         line, own, share = more[a - first], rows[index[a - first]], _moved(cut, a)
         if abs(share) > _SAME:
@@ -180,18 +196,18 @@ def _within_reach(cut, span, index, functions, of, rows):
             for i in range(width):
                 line[i] = share * own[i]
         for c in range(2):
-            part = cut.kids[a, c] - first
+            part = cut.children[a, c] - first
             if changed[part]:
                 changed[a - first] = True
                 for i in range(width):
-                    line[i] += cut.parts[a, c] * more[part, i]
+                    line[i] += cut.child_weights[a, c] * more[part, i]
     for f in range(of.shape[0]):
         a = functions.cluster[of[f]]
         own = rows[index[a - first] if a >= 0 else 0]
         for i in range(width):
             out[f, i] = own[i]
         for c in range(2 if a >= 0 else 1):
-            part = (cut.kids[a, c] if a >= 0 else -1 - a) - first
+            part = (cut.children[a, c] if a >= 0 else -1 - a) - first
             sign = 1.0 - 2.0 * c
             if changed[part]:
                 for i in range(width):

@@ -12,7 +12,7 @@ from capsense._dense import padded
 from capsense._jit import compiled, kernel
 from capsense._simd import WIDE, doubles, integers
 from capsense.field.green_kernels import (
-    SHORE,
+    WALL_FADE_LENGTH,
     keep_off,
     on_face,
     point_potentials,
@@ -43,7 +43,7 @@ _CLOSE = 8e-3, 12e-3
 second those of the table."""
 
 
-class Looks(NamedTuple):
+class ClusterEvaluation(NamedTuple):
     """The clusters that were looked at: those of each body, wholes first; then parts of panels.
 
     There is room for n, of which only so many are filled as were looked at.
@@ -51,34 +51,40 @@ class Looks(NamedTuple):
 
     node: NDArray[Any]
     """Place of each in its body's tree, shape (n,)."""
-    kids: NDArray[Any]
+    children: NDArray[Any]
     """Row of its first part, which the second follows; -1 where none was looked at, (n,)."""
     means: NDArray[Any]
     """Mean of φ⁰ [V], shape (n, lead)."""
-    linear: NDArray[Any]
+    linearity: NDArray[Any]
     """How linear φ⁰ is there, 0 to 1, shape (n,)."""
-    told: NDArray[Any]
+    ancestor_weight: NDArray[Any]
     """How much it is not in all clusters above, shape (n,)."""
-    crossing: NDArray[Any]
+    wall_crossing_weight: NDArray[Any]
     """How much it crosses a wall, shape (n,)."""
-    stiff: NDArray[Any]
+    screening_factor: NDArray[Any]
     """Energy of its charge function in front of a flat design, over that in free space, (n,); not
     filled where that is not looked into."""
     score: NDArray[Any]
     """Share of the electrodes' energies that its function takes up alone, raised by those of its
     parts, shape (n,)."""
-    entry: NDArray[Any]
+    refinement_score: NDArray[Any]
     """Of panels, the score from which on they have parts, shape (n,)."""
 
 
 @compiled
-def room_for(count, lead):
+def room_for(count, phi_columns):
     """Room for so many clusters."""
-    return Looks(
-        np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, lead), np.float32),
-        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
+    return ClusterEvaluation(
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+        np.empty((count, phi_columns), np.float32),
         np.empty(count),
-    )  # fmt: skip
+        np.empty(count),
+        np.empty(count),
+        np.empty(count),
+        np.empty(count),
+        np.empty(count),
+    )
 
 
 @compiled
@@ -92,12 +98,15 @@ def with_room(looks, filled, more):
         return looks
     out = room_for(2 * filled + more, looks.means.shape[1])
     for k in range(filled):
-        out.node[k], out.kids[k] = looks.node[k], looks.kids[k]
+        out.node[k], out.children[k] = looks.node[k], looks.children[k]
         for i in range(looks.means.shape[1]):
             out.means[k, i] = looks.means[k, i]
-        out.linear[k], out.told[k] = looks.linear[k], looks.told[k]
-        out.crossing[k], out.stiff[k] = looks.crossing[k], looks.stiff[k]
-        out.score[k], out.entry[k] = looks.score[k], looks.entry[k]
+        out.linearity[k], out.ancestor_weight[k] = looks.linearity[k], looks.ancestor_weight[k]
+        out.wall_crossing_weight[k], out.screening_factor[k] = (
+            looks.wall_crossing_weight[k],
+            looks.screening_factor[k],
+        )
+        out.score[k], out.refinement_score[k] = looks.score[k], looks.refinement_score[k]
     return out
 
 
@@ -126,8 +135,8 @@ def place(body, space, k, points, found, middle):
         for q in range(3):
             x += body.scale * body.rotation[i, q] * center[3 * k + q]
         middle[i] = points[found, i] = x
-        room = min(room, x - space.room[0, i], space.room[1, i] - x)
-        out += max(space.room[0, i] - x, x - space.room[1, i], 0.0) ** 2
+        room = min(room, x - space.active_bounds[0, i], space.active_bounds[1, i] - x)
+        out += max(space.active_bounds[0, i] - x, x - space.active_bounds[1, i], 0.0) ** 2
     square, height = face_distance(middle, space)
     if square < 4.0 * space.validity * space.validity and space.cover < 1.0:
         keep_off(points[found : found + 1], space)
@@ -136,8 +145,9 @@ def place(body, space, k, points, found, middle):
 
 
 @kernel
-def stiffness(cover, size, square, height):
-    """:attr:`Looks.stiff` of a cluster of some size [m], from what :func:`place` returns.
+def screening(cover, size, square, height):
+    """:attr:`ClusterEvaluation.screening_factor` of a cluster of some size [m], from what
+    :func:`place` returns.
 
     ``cover`` is :attr:`Space.cover`.
     """
@@ -167,8 +177,8 @@ def look(body, green, coarser, looks, start):
     Returns:
         The row behind the last one that was filled.
     """
-    places, inner = np.empty(body.stored, np.int64), np.empty(body.stored)
-    points = np.empty((body.stored, 3), np.float32)
+    places, inner = np.empty(body.n_panel_clusters, np.int64), np.empty(body.n_panel_clusters)
+    points = np.empty((body.n_panel_clusters, 3), np.float32)
     stop, found = _look_into(
         body, green, coarser, looks, start, (points, places, inner, np.empty(3))
     )
@@ -184,9 +194,13 @@ def _look_into(body, green, coarser, looks, start, wanted):
     Returns:
         The row behind the last one that was filled, and how many points there are.
     """
-    kids, extent, (points, rows, inner, middle) = integers(body.kids), doubles(body.extent), wanted
+    children, extent, (points, rows, inner, middle) = (
+        integers(body.children),
+        doubles(body.extent),
+        wanted,
+    )
     space = green.space
-    looks.node[start], looks.told[start] = 0, 1.0
+    looks.node[start], looks.ancestor_weight[start] = 0, 1.0
     row, stop, found = start - 1, start + 1, np.int64(0)
     while row + 1 < stop:
         row += 1
@@ -194,30 +208,34 @@ def _look_into(body, green, coarser, looks, start, wanted):
         size, (square, height, room, out) = (
             body.scale * extent[k], place(body, space, k, points, found, middle),
         )  # fmt: skip
-        share = 1.0 - smooth(out / (SHORE * space.extent)) if out > 0.0 else 1.0
-        looks.crossing[row] = looks.linear[row] = 0.0
+        share = 1.0 - smooth(out / (WALL_FADE_LENGTH * space.extent)) if out > 0.0 else 1.0
+        looks.wall_crossing_weight[row] = looks.linearity[row] = 0.0
         if size > max(LONG[0] * space.extent, 2.0 * abs(room)):
-            looks.crossing[row] = smooth(2.0 - 4.0 * abs(room) / size) * smooth(
+            looks.wall_crossing_weight[row] = smooth(2.0 - 4.0 * abs(room) / size) * smooth(
                 (size / space.extent - LONG[0]) / (LONG[1] - LONG[0])
             )
         if k >= _COARSE:
             part = size / (coarser * math.sqrt(square + 1e-12))
             even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
-            looks.linear[row] = (1.0 - share * (1.0 - even)) * (1.0 - looks.crossing[row])
-        for i in range(green.lead):
+            looks.linearity[row] = (1.0 - share * (1.0 - even)) * (
+                1.0 - looks.wall_crossing_weight[row]
+            )
+        for i in range(green.phi_columns):
             looks.means[row, i] = 0.0
-        whole = not 0 <= kids[2 * k] < body.stored
-        if share > 0.0 and (looks.linear[row] > 0.0 or whole):
+        whole = not 0 <= children[2 * k] < body.n_panel_clusters
+        if share > 0.0 and (looks.linearity[row] > 0.0 or whole):
             rows[found], inner[found] = row, share
             found += 1
-        looks.kids[row] = -1
-        if whole or looks.linear[row] < 1.0:
-            looks.stiff[row] = stiffness(green.cover, size, square, height)
-        if looks.linear[row] < 1.0 and not whole:
-            looks.kids[row] = stop
+        looks.children[row] = -1
+        if whole or looks.linearity[row] < 1.0:
+            looks.screening_factor[row] = screening(green.cover, size, square, height)
+        if looks.linearity[row] < 1.0 and not whole:
+            looks.children[row] = stop
             for c in range(2):
-                looks.node[stop] = kids[2 * k + c]
-                looks.told[stop] = looks.told[row] * (1.0 - looks.linear[row])
+                looks.node[stop] = children[2 * k + c]
+                looks.ancestor_weight[stop] = looks.ancestor_weight[row] * (
+                    1.0 - looks.linearity[row]
+                )
                 stop += 1
     return stop, found
 
@@ -237,11 +255,11 @@ def far_potentials(points, places, share, green, means):
     if count == 0:
         return
     columns = _columns(points, near[:count])
-    phi = np.empty((green.lead, columns.shape[1]), np.float32)
+    phi = np.empty((green.phi_columns, columns.shape[1]), np.float32)
     limits = np.float32(green.floor), np.float32(green.levels[-1].least)
     point_potentials(columns, green.levels[-1].sources, green.score_table, limits, phi)
     for j in range(count):
-        for i in range(green.lead):
+        for i in range(green.phi_columns):
             means[places[near[j]], i] += np.float32(close[j]) * phi[i, j]
 
 
@@ -286,10 +304,10 @@ def _make_up(body, start, stop, looks):
     """Mean potentials of clusters from those of their parts, where they do not see a linear one."""
     charge, means, one = doubles(body.charge), looks.means, np.float32(1.0)
     for row in range(stop - 1, start - 1, -1):
-        x = looks.kids[row]
+        x = looks.children[row]
         if x >= 0:
             p = np.float32(charge[looks.node[x]] / charge[looks.node[row]])
-            t = np.float32(looks.linear[row])
+            t = np.float32(looks.linearity[row])
             q, r = (one - t) * p, (one - t) * (one - p)
             for i in range(means.shape[1]):
                 whole = t * means[row, i] if t > 0.0 else np.float32(0.0)

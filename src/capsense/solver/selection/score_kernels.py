@@ -8,13 +8,13 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
-from capsense.field.green_kernels import SHORE, smooth
+from capsense.field.green_kernels import WALL_FADE_LENGTH, smooth
 from capsense.solver.selection.evaluation_kernels import (
     far_potentials,
     look,
     place,
     room_for,
-    stiffness,
+    screening,
     with_room,
 )
 
@@ -52,7 +52,7 @@ def score(bodies, green, threshold, weight):
     Returns:
         The clusters that were looked at, and the row of each body's first one, shape (b + 1,).
     """
-    terminals, looks = green.terminals, room_for(0, green.lead)
+    terminals, looks = green.terminals, room_for(0, green.phi_columns)
     energy, first = np.zeros(terminals), np.zeros(bodies.shape[0] + 1, np.int64)
     coarser = max(1.0, (threshold / _USUAL) ** (1.0 / 3.0))
     for b in range(bodies.shape[0]):
@@ -82,12 +82,14 @@ def _add_energies(body, looks, rows, energy):
     """
     means = looks.means
     for k in range(rows[1] - 1, rows[0] - 1, -1):
-        x = looks.kids[k]
+        x = looks.children[k]
         if x >= 0:
-            stiffness = looks.told[k] * (1.0 - looks.linear[k]) / _energy(body, looks.node[k])
+            screening = (
+                looks.ancestor_weight[k] * (1.0 - looks.linearity[k]) / _energy(body, looks.node[k])
+            )
             for i in range(energy.shape[0]):
                 d = float(means[x, i] - means[x + 1, i])
-                energy[i] += d * d * stiffness
+                energy[i] += d * d * screening
     if not body.neutral:
         for i in range(energy.shape[0]):
             energy[i] += float(means[rows[0], i]) ** 2 / _net_energy(body)
@@ -97,13 +99,13 @@ def _add_energies(body, looks, rows, energy):
 def _energy(body, k):
     """Energy of the function of a cluster [1/m]; of a dielectric about that on a half-space."""
     own = doubles(body.own)[integers(body.function)[k]]
-    return (1.0 + body.stiffer) * own / body.scale
+    return (1.0 + body.polarization_stiffness) * own / body.scale
 
 
 @kernel
 def _net_energy(body):
     """Energy of a body's net charge [1/m]."""
-    return doubles(body.own)[0] / body.scale + body.tie
+    return doubles(body.own)[0] / body.scale + body.ground_elastance
 
 
 @kernel
@@ -113,11 +115,11 @@ def _own_score(body, looks, row, weight):
     It counts for more where the design leaves the function less of its energy: twice over for
     that, and once more as the errors of all that is left out there go the same way.
     """
-    x, value = looks.kids[row], 0.0
+    x, value = looks.children[row], 0.0
     for i in range(weight.shape[0]):
         d = float(looks.means[x, i] - looks.means[x + 1, i])
         value += weight[i] * d * d
-    return value / (_energy(body, looks.node[row]) * looks.stiff[row] ** 3)
+    return value / (_energy(body, looks.node[row]) * looks.screening_factor[row] ** 3)
 
 
 @kernel
@@ -131,21 +133,21 @@ def _raised(value, first, second):
 @kernel
 def _pass_on(part, above, looks):
     """Let a cluster have a part of the score above it as far as that sees a linear potential."""
-    rest = 1.0 - looks.told[part] * (1.0 - looks.linear[part])
-    looks.score[part] = looks.told[part] * looks.score[part] + rest * DECAY * above
+    rest = 1.0 - looks.ancestor_weight[part] * (1.0 - looks.linearity[part])
+    looks.score[part] = looks.ancestor_weight[part] * looks.score[part] + rest * DECAY * above
 
 
 @kernel
 def _share(looks, row):
     """What the score of a panel or a part counts."""
-    taken = 1.0 - looks.stiff[row] * looks.stiff[row]
+    taken = 1.0 - looks.screening_factor[row] * looks.screening_factor[row]
     return min(1.0, max(0.0, (taken - _FREE[0]) / (_FREE[1] - _FREE[0])))
 
 
 @kernel
 def _has_parts(body, looks, row):
     """Whether a cluster is a panel that has parts."""
-    return integers(body.kids)[2 * looks.node[row]] >= body.stored
+    return integers(body.children)[2 * looks.node[row]] >= body.n_panel_clusters
 
 
 @compiled
@@ -177,13 +179,13 @@ def _raise_scores(body, looks, rows, weight, counts):
     it is split too, which its own score does not tell. So that is at least the score of the body,
     times the part's share of its length. ``counts``, one for each, is room to work in.
     """
-    kids, extent, (start, stop) = integers(body.kids), doubles(body.extent), rows
-    scores, crossing = looks.score, looks.crossing
+    children, extent, (start, stop) = integers(body.children), doubles(body.extent), rows
+    scores, crossing = looks.score, looks.wall_crossing_weight
     for k in range(stop - 1, start - 1, -1):
-        x = looks.kids[k]
+        x = looks.children[k]
         if 0 <= x < stop:
             own = _own_score(body, looks, k, weight)
-            scores[k] = (1.0 - looks.linear[k]) * _raised(own, scores[x], scores[x + 1])
+            scores[k] = (1.0 - looks.linearity[k]) * _raised(own, scores[x], scores[x + 1])
         counts[k - start] = 1.0
     if not body.neutral:
         net = 0.0
@@ -191,18 +193,20 @@ def _raise_scores(body, looks, rows, weight, counts):
             net += weight[i] * float(looks.means[start, i]) ** 2
         scores[start] = max(scores[start], crossing[start] * net / _net_energy(body))
     for k in range(start, stop):
-        x = looks.kids[k]
+        x = looks.children[k]
         if not 0 <= x < stop:
             continue
         for part in range(x, x + 2):
-            if 0 <= kids[2 * looks.node[part]] < body.stored:
+            if 0 <= children[2 * looks.node[part]] < body.n_panel_clusters:
                 _pass_on(part, scores[k], looks)
-                counts[part - start] = counts[k - start] * smooth((1.0 - looks.linear[k]) / _SEEN)
+                counts[part - start] = counts[k - start] * smooth(
+                    (1.0 - looks.linearity[k]) / _SEEN
+                )
     whole = scores[start]
     # what has no net charge carries none where no function of it counts
     forced = min(_CROSSED, _FULLY * whole) if body.neutral else _CROSSED
     for k in range(stop - 1, start - 1, -1):
-        size, x = extent[looks.node[k]], looks.kids[k]
+        size, x = extent[looks.node[k]], looks.children[k]
         wide = smooth((body.scale * size - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
         least = max(forced * wide, whole * size / extent[0])
         scores[k] = max(scores[k], counts[k - start] * crossing[k] * least)
@@ -228,25 +232,25 @@ def _score_parts(body, green, looks, rows, limits):
         The first row that is free then.
     """
     (start, stop, last), (threshold, weight) = rows, limits
-    if body.stored == 2 * body.n - 1:
+    if body.n_panel_clusters == 2 * body.n - 1:
         return last
     nodes, count = np.empty(stop - start, np.int64), 0
     for k in range(start, stop):
-        x = looks.kids[k]
+        x = looks.children[k]
         if not 0 <= x < stop:
             continue
         for panel in range(x, x + 2):
             if _has_parts(body, looks, panel):
-                looks.entry[panel] = _share(looks, panel) * looks.score[k]
-                if looks.entry[panel] > threshold:
+                looks.refinement_score[panel] = _share(looks, panel) * looks.score[k]
+                if looks.refinement_score[panel] > threshold:
                     nodes[count] = panel
                     count += 1
-    kids = integers(body.kids)
+    children = integers(body.children)
     while count > 0:
         below, many = np.empty(2 * count, np.int64), 0
         for k in nodes[:count]:
-            for part in range(looks.kids[k], looks.kids[k] + 2):
-                if looks.score[k] > threshold and kids[2 * looks.node[part]] >= 0:
+            for part in range(looks.children[k], looks.children[k] + 2):
+                if looks.score[k] > threshold and children[2 * looks.node[part]] >= 0:
                     below[many] = part
                     many += 1
         last = _raise_nodes(body, green, below[:many], looks, last, weight)
@@ -261,16 +265,16 @@ def _raise_nodes(body, green, nodes, looks, last, weight):
     Returns:
         The first row that is free, which was ``last``.
     """
-    kids, below, count = integers(body.kids), np.empty(2 * nodes.shape[0], np.int64), 0
+    children, below, count = integers(body.children), np.empty(2 * nodes.shape[0], np.int64), 0
     for k in nodes:
-        for part in range(looks.kids[k], looks.kids[k] + 2):
+        for part in range(looks.children[k], looks.children[k] + 2):
             looks.score[part] = 0.0
-            if kids[2 * looks.node[part]] >= 0:
+            if children[2 * looks.node[part]] >= 0:
                 below[count] = part
                 count += 1
     last = _score_nodes(body, green, below[:count], looks, last, weight)
     for k in nodes:
-        x = looks.kids[k]
+        x = looks.children[k]
         looks.score[k] = _raised(looks.score[k], looks.score[x], looks.score[x + 1])
     return last
 
@@ -285,18 +289,18 @@ def _score_nodes(body, green, nodes, looks, last, weight):
     Returns:
         The first row that is free, which was ``last``.
     """
-    kids, many = integers(body.kids), 2 * nodes.shape[0]
+    children, many = integers(body.children), 2 * nodes.shape[0]
     points, rows, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
     space, middle = green.space, np.empty(3)
     for j in range(many):
         k, rows[j] = nodes[j // 2], last + j
         if j % 2 == 0:
-            looks.kids[k] = rows[j]
-        looks.node[rows[j]], looks.kids[rows[j]] = kids[2 * looks.node[k]] + j % 2, -1
+            looks.children[k] = rows[j]
+        looks.node[rows[j]], looks.children[rows[j]] = children[2 * looks.node[k]] + j % 2, -1
         square, height, _, out = place(body, space, looks.node[rows[j]], points, j, middle)
         size = body.scale * doubles(body.extent)[looks.node[rows[j]]]
-        looks.stiff[rows[j]] = stiffness(green.cover, size, square, height)
-        inner[j] = 1.0 - smooth(out / (SHORE * space.extent))
+        looks.screening_factor[rows[j]] = screening(green.cover, size, square, height)
+        inner[j] = 1.0 - smooth(out / (WALL_FADE_LENGTH * space.extent))
     far_potentials(points, rows, inner, green, looks.means)
     for k in nodes:
         looks.score[k] = _share(looks, k) * _own_score(body, looks, k, weight)

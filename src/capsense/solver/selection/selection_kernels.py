@@ -21,30 +21,30 @@ _PARTED = 0.1
 """Fade of a function from which on its two clusters are represented by their parts alone."""
 
 
-class Cut(NamedTuple):
+class ActiveTree(NamedTuple):
     """The clusters that a scene needs, body after body: parts behind wholes, of panels last."""
 
     body: NDArray[Any]
     """Body of a cluster, shape (k,)."""
     node: NDArray[Any]
     """Its place in the body's tree, shape (k,)."""
-    kids: NDArray[Any]
+    children: NDArray[Any]
     """Its parts in this list, -1 for a leaf, shape (k, 2)."""
-    share: NDArray[Any]
+    charge_fraction: NDArray[Any]
     """Share of the first part in its equilibrium charge, shape (k,)."""
-    parts: NDArray[Any]
+    child_weights: NDArray[Any]
     """Shares of its two parts in the charge within reach, beside ``whole``, shape (k, 2)."""
-    leaf: NDArray[Any]
+    active_index: NDArray[Any]
     """Its number among the leaves, else -1, shape (k,)."""
-    whole: NDArray[Any]
+    self_weight: NDArray[Any]
     """How far it is represented by itself, not by its parts: 1 where it is not split, (k,)."""
     fade: NDArray[Any]
     """How far its function is faded in, 0 to 1, shape (k,)."""
-    above: NDArray[Any]
+    parent_fade: NDArray[Any]
     """The same of the cluster above, 1 at the top, shape (k,)."""
-    there: NDArray[Any]
+    inside_weight: NDArray[Any]
     """How far something of it within reach is represented, 0 to 1, shape (k,)."""
-    leaves: NDArray[Any]
+    active: NDArray[Any]
     """The leaves in this list: clusters that are represented by themselves, shape (l,)."""
 
 
@@ -59,9 +59,9 @@ class Functions(NamedTuple):
     """Its body, shape (f,)."""
     fade: NDArray[Any]
     """How far it is faded in, 0 to 1, shape (f,)."""
-    above: NDArray[Any]
+    parent_fade: NDArray[Any]
     """The same of the function above, 1 at the top, shape (f,)."""
-    ends: NDArray[Any]
+    panel_end_fraction: NDArray[Any]
     """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,); 0 where
     something of the cluster is out of reach."""
     solved: int
@@ -86,7 +86,7 @@ class _Queue(NamedTuple):
     """Its row among the clusters that were looked at, -1 for others, shape (n,)."""
     score: NDArray[Any]
     fade: NDArray[Any]
-    above: NDArray[Any]
+    parent_fade: NDArray[Any]
 
 
 @compiled
@@ -102,7 +102,11 @@ def _with_room(queue, filled, more):
     for k in range(filled):
         out.body[k], out.node[k] = queue.body[k], queue.node[k]
         out.first[k], out.row[k] = queue.first[k], queue.row[k]
-        out.score[k], out.fade[k], out.above[k] = queue.score[k], queue.fade[k], queue.above[k]
+        out.score[k], out.fade[k], out.parent_fade[k] = (
+            queue.score[k],
+            queue.fade[k],
+            queue.parent_fade[k],
+        )
     return out
 
 
@@ -138,19 +142,21 @@ def _split(bodies, b, looks, queue, start, limits, facing):
         The place behind the last one, and how many of them are leaves.
     """
     body = bodies[b]
-    kids, stop, leaves = integers(body.kids), start + 1, 0
+    children, stop, leaves = integers(body.children), start + 1, 0
     for parts in range(2):
         i = start - 1
         while i + 1 < stop:
             i += 1
-            if (max(queue.node[i], kids[2 * queue.node[i]]) >= body.stored) != (parts == 1):
+            if (max(queue.node[i], children[2 * queue.node[i]]) >= body.n_panel_clusters) != (
+                parts == 1
+            ):
                 continue
             queue.first[i], queue.fade[i] = -1, 0.0
-            if queue.above[i] > 0.0 and kids[2 * queue.node[i]] >= 0:
+            if queue.parent_fade[i] > 0.0 and children[2 * queue.node[i]] >= 0:
                 queue.first[i] = stop
                 least = crowded(bodies, facing, b, queue.node[i])
                 stop = _put_parts(body, looks, queue, (i, stop), limits, least)
-            leaves += _whole(queue.first[i], queue.above[i]) > 0.0
+            leaves += _whole(queue.first[i], queue.parent_fade[i]) > 0.0
     return stop, leaves
 
 
@@ -163,14 +169,14 @@ def _put_parts(body, looks, queue, places, limits, least):
     Returns:
         The place behind them.
     """
-    kids, (i, stop), (threshold, width) = integers(body.kids), places, limits
-    queue.fade[i] = min(max(_faded(queue.score[i], threshold, width), least), queue.above[i])
+    children, (i, stop), (threshold, width) = integers(body.children), places, limits
+    queue.fade[i] = min(max(_faded(queue.score[i], threshold, width), least), queue.parent_fade[i])
     row = queue.row[i]
     for c in range(2):
-        part, above = kids[2 * queue.node[i] + c], queue.fade[i]
-        seen = looks.kids[row] + c if row >= 0 and looks.kids[row] >= 0 else -1
-        if part < body.stored <= kids[2 * part]:  # a panel that has parts
-            share = _faded(looks.entry[seen], threshold, width) if seen >= 0 else 0.0
+        part, above = children[2 * queue.node[i] + c], queue.fade[i]
+        seen = looks.children[row] + c if row >= 0 and looks.children[row] >= 0 else -1
+        if part < body.n_panel_clusters <= children[2 * part]:  # a panel that has parts
+            share = _faded(looks.refinement_score[seen], threshold, width) if seen >= 0 else 0.0
             above = min(above, max(share, least))
         value = looks.score[seen] if seen >= 0 else DECAY * queue.score[i]
         stop = _put(queue, stop, queue.body[i], (part, seen), value, above)
@@ -184,7 +190,7 @@ def _put(queue, place, b, cluster, score, above):
     Returns:
         The place behind it.
     """
-    queue.body[place], queue.score[place], queue.above[place] = b, score, above
+    queue.body[place], queue.score[place], queue.parent_fade[place] = b, score, above
     queue.node[place], queue.row[place] = cluster
     return place + 1
 
@@ -203,25 +209,25 @@ def _whole(first, above):
 
 @compiled
 def _collect(bodies, queue, count, leaves):
-    cut = Cut(
+    cut = ActiveTree(
         queue.body[:count], queue.node[:count], np.empty((count, 2), np.int64), np.zeros(count),
         np.zeros((count, 2)), np.empty(count, np.int64), np.empty(count), queue.fade[:count],
-        queue.above[:count], np.ones(count), np.empty(leaves, np.int64),
+        queue.parent_fade[:count], np.ones(count), np.empty(leaves, np.int64),
     )  # fmt: skip
     leaf = 0
     for a in range(count):
         body, k, first = bodies[cut.body[a]], cut.node[a], queue.first[a]
-        kids, charge = integers(body.kids), doubles(body.charge)
-        cut.whole[a] = _whole(first, cut.above[a])
-        cut.leaf[a] = cut.kids[a, 0] = cut.kids[a, 1] = -1
-        if cut.whole[a] > 0.0:
-            cut.leaf[a], cut.leaves[leaf] = leaf, a
+        children, charge = integers(body.children), doubles(body.charge)
+        cut.self_weight[a] = _whole(first, cut.parent_fade[a])
+        cut.active_index[a] = cut.children[a, 0] = cut.children[a, 1] = -1
+        if cut.self_weight[a] > 0.0:
+            cut.active_index[a], cut.active[leaf] = leaf, a
             leaf += 1
         if first >= 0:
-            cut.kids[a, 0], cut.kids[a, 1] = first, first + 1
-            cut.share[a] = charge[kids[2 * k]] / charge[k]
-            cut.parts[a, 0] = (1.0 - cut.whole[a]) * cut.share[a]
-            cut.parts[a, 1] = (1.0 - cut.whole[a]) - cut.parts[a, 0]
+            cut.children[a, 0], cut.children[a, 1] = first, first + 1
+            cut.charge_fraction[a] = charge[children[2 * k]] / charge[k]
+            cut.child_weights[a, 0] = (1.0 - cut.self_weight[a]) * cut.charge_fraction[a]
+            cut.child_weights[a, 1] = (1.0 - cut.self_weight[a]) - cut.child_weights[a, 0]
     return cut
 
 
@@ -236,12 +242,12 @@ def functions_of(bodies, cut, beyond):
     count = bodies.shape[0]
     reaches_out = np.zeros(cut.node.shape[0], np.bool_)
     for a in range(cut.node.shape[0] - 1, -1, -1):
-        if cut.leaf[a] >= 0:
-            reaches_out[a] = beyond[cut.leaf[a]] > 0.0
-        if cut.kids[a, 0] >= 0:
-            count += is_there(cut, cut.kids[a, 0]) and is_there(cut, cut.kids[a, 1])
+        if cut.active_index[a] >= 0:
+            reaches_out[a] = beyond[cut.active_index[a]] > 0.0
+        if cut.children[a, 0] >= 0:
+            count += is_there(cut, cut.children[a, 0]) and is_there(cut, cut.children[a, 1])
             for c in range(2):
-                reaches_out[a] = reaches_out[a] or reaches_out[cut.kids[a, c]]
+                reaches_out[a] = reaches_out[a] or reaches_out[cut.children[a, c]]
     cluster, number = np.empty(count, np.int64), np.empty(count, np.int64)
     body = np.empty(count, np.int64)
     fade, above, ends = np.empty(count), np.empty(count), np.zeros(count)
@@ -251,15 +257,15 @@ def functions_of(bodies, cut, beyond):
             b = cut.body[a]
             if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral and is_there(cut, a):
                 cluster[f], number[f], body[f] = -1 - a, 0, b
-                fade[f] = above[f] = smooth(cut.there[a] / _FULL)
+                fade[f] = above[f] = smooth(cut.inside_weight[a] / _FULL)
                 f += 1
-            x, y = cut.kids[a]
+            x, y = cut.children[a]
             parted = x >= 0 and is_there(cut, x) and is_there(cut, y)
             if parted and (cut.fade[a] == 0.0) == (rest == 1):
                 # functions are numbered breadth first, as clusters are
                 cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
-                full = smooth(min(cut.there[x], cut.there[y]) / _FULL)
-                fade[f], above[f] = full * cut.fade[a], full * cut.above[a]
+                full = smooth(min(cut.inside_weight[x], cut.inside_weight[y]) / _FULL)
+                fade[f], above[f] = full * cut.fade[a], full * cut.parent_fade[a]
                 ends[f] = 0.0 if reaches_out[a] else _panels(bodies[b], cut.node[a])
                 f += 1
         if rest == 0:
@@ -272,7 +278,7 @@ def functions_of(bodies, cut, beyond):
 @kernel
 def is_there(cut, a):
     """Whether anything of a cluster is within reach."""
-    return cut.whole[a] + cut.parts[a, 0] + cut.parts[a, 1] > 0.0
+    return cut.self_weight[a] + cut.child_weights[a, 0] + cut.child_weights[a, 1] > 0.0
 
 
 @kernel
@@ -282,8 +288,8 @@ def _function(body, node):
 
 @compiled
 def _panels(body, node):
-    kids, out = integers(body.kids), 0.0
+    children, out = integers(body.children), 0.0
     for c in range(2):
-        if kids[2 * kids[2 * node + c]] < 0:
+        if children[2 * children[2 * node + c]] < 0:
             out += 0.5
     return out

@@ -24,7 +24,7 @@ def _product(left: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
 def solve_lossy(
     records: NDArray[np.void],
     ties: NDArray[np.complex128],
-    softness: NDArray[np.complex128],
+    inverse_susceptibility: NDArray[np.complex128],
     green: Green,
     threshold: float,
     width: float,
@@ -41,22 +41,22 @@ def solve_lossy(
     fabric = np.zeros((green.terminals, green.terminals))
     fabric_change(records, green, fabric)
     records = records.copy()
-    records["softness"] = np.abs(softness)
+    records["inverse_susceptibility"] = np.abs(inverse_susceptibility)
     near = near_bodies(records, green, True)
     press_out(records, near, green)
-    found = _lossy_lifted(records, ties, softness, green, threshold, width)
+    found = _lossy_lifted(records, ties, inverse_susceptibility, green, threshold, width)
     if not near.any():
         return found._replace(delta=found.delta + fabric)
 
     def real(value: float, outline: bool = True) -> NDArray[Any]:
         some = records.copy()
-        some["softness"][near] = value
+        some["inverse_susceptibility"][near] = value
         some["outline"][near] *= outline
         return np.asarray(solve_lifted(some, green, threshold, width, False).delta)
 
     rest, off = np.zeros_like(found.delta), np.zeros_like(found.delta.real)
     if not near.all():
-        gone = np.where(near, NOTHING, softness)
+        gone = np.where(near, NOTHING, inverse_susceptibility)
         rest = _lossy_lifted(records, ties, gone, green, threshold, width).delta
         off = real(NOTHING)
     delta = rest + in_series_lossy(found.delta - rest, real(0.0, False) - off, real(0.0) - off)
@@ -67,21 +67,21 @@ def solve_lossy(
 def _lossy_lifted(
     records: NDArray[np.void],
     ties: NDArray[np.complex128],
-    softness: NDArray[np.complex128],
+    inverse_susceptibility: NDArray[np.complex128],
     green: Green,
     threshold: float,
     width: float,
 ) -> Solution:
     """As :func:`solve_lossy`, of bodies that are lifted near the design."""
     plain = records.copy()
-    plain["tie"], plain["softness"] = 0.0, 0.0
+    plain["ground_elastance"], plain["inverse_susceptibility"] = 0.0, 0.0
     none = facing_of(plain[:0])
     cut, leaves, functions, system = prepared(plain, green, threshold, width, none, plain)
-    plain["softness"] = 1.0
+    plain["inverse_susceptibility"] = 1.0
     inside = prepared(plain, green, threshold, width, none, plain)[3]
     phi, real, below, own = system
     n, m = functions.solved, green.terminals
-    factor = softness[functions.body]
+    factor = inverse_susceptibility[functions.body]
     matrix = np.concatenate([real, below]).astype(complex)
     matrix += factor[:, None] * np.concatenate([inside.matrix - real, inside.rest - below])
     diagonal = own + factor * (inside.own - own)
@@ -89,7 +89,9 @@ def _lossy_lifted(
     for b in range(len(records)):
         root = np.flatnonzero((functions.body == b) & net)
         others = np.flatnonzero(net & (records["group"][functions.body] == records["group"][b]))
-        matrix[np.ix_(root, others)] += ties[b] if np.isfinite(ties[b]) else records["tie"][b]
+        matrix[np.ix_(root, others)] += (
+            ties[b] if np.isfinite(ties[b]) else records["ground_elastance"][b]
+        )
     diagonal[:n] = np.diag(matrix)
     fade = functions.fade
     root = np.sqrt(fade[:n])
@@ -100,19 +102,21 @@ def _lossy_lifted(
     solved = (root[:, None] * phi[:n, :m]).astype(complex)
     eliminate(faded, solved)
     solved *= root[:, None] if shift >= 0.0 else np.nan
-    lack = GAIN * (1 - fade) * (1 - (1 - functions.above) ** 4) / diagonal
+    lack = GAIN * (1 - fade) * (1 - (1 - functions.parent_fade) ** 4) / diagonal
     residual = phi[:, :m] - _product(matrix, solved)
     extra = lack[:, None] * residual
     left = _product(residual.T, extra)
     x = np.zeros((len(fade), m), complex)
     x[:n], x[n:] = solved, extra[n:]
     delta = _product(phi[:n, :m].T, solved) + left
-    coarse = COARSE * (functions.ends[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
+    coarse = (
+        COARSE * (functions.panel_end_fraction[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
+    )
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     delta, left = 0.5 * (delta + delta.T), np.ascontiguousarray(left.real)
     error = estimate(np.ascontiguousarray(delta.real), left, coarse, shift, green.electrodes)
     return Solution(
         delta, left, coarse, charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, n, shift, error,
+        leaves.points, leaves.extent, leaves.softening_length, leaves.owner, n, shift, error,
         np.zeros(len(records), np.bool_), np.full(len(records), -1), np.zeros((m, m)),
     )  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 from capsense._dense import WIDTH, padded
 from capsense._jit import compiled
 from capsense.solver.system.system_kernels import System
-from capsense.solver.tree.matter import SHUT
+from capsense.solver.tree.matter import FLOATING_PENALTY
 
 
 @compiled
@@ -29,16 +29,16 @@ def as_nodes(bodies, near, green):
     capacitance = np.zeros(count)
     for b in range(count):
         body = bodies[b]
-        if near[b] and (body.neutral != 0 or body.tie > 0.0) and group[body.group] < 0:
+        if near[b] and (body.neutral != 0 or body.ground_elastance > 0.0) and group[body.group] < 0:
             group[body.group] = green.terminals + nodes
-            if body.neutral == 0 and body.tie < 0.5 * SHUT:
-                capacitance[nodes] = 1.0 / body.tie
+            if body.neutral == 0 and body.ground_elastance < 0.5 * FLOATING_PENALTY:
+                capacitance[nodes] = 1.0 / body.ground_elastance
             nodes += 1
     if nodes > 0:
         for b in range(count):
             node[b] = group[bodies[b].group]
             if node[b] >= 0:
-                bodies[b].neutral, bodies[b].tie = 0, 0.0
+                bodies[b].neutral, bodies[b].ground_elastance = 0, 0.0
     return green.terminals, nodes, node, capacitance[:nodes]
 
 
@@ -52,7 +52,7 @@ def with_nodes(system, functions, node, terminals, nodes):
             phi[f, i] = system.phi[f, i]
         if functions.cluster[f] < 0 and node[functions.body[f]] >= 0:
             phi[f, node[functions.body[f]]] = -1.0
-    return System(phi, system.matrix, system.rest, system.own)
+    return System(phi, system.matrix, system.rest, system.diagonal)
 
 
 @compiled
@@ -115,10 +115,10 @@ def congruent(weights, matrix, capacitance):
 
 
 @compiled
-def mixed(charge, weights, lead):
+def mixed(charge, weights, phi_columns):
     """Charges (l, k) with terminals and nodes at 1 V, reduced to the terminals, (l, lead)."""
     size, m = weights.shape
-    out = np.zeros((charge.shape[0], lead))
+    out = np.zeros((charge.shape[0], phi_columns))
     for f in range(charge.shape[0]):
         for i in range(m):
             value = charge[f, i]

@@ -26,9 +26,9 @@ from capsense.solver.gap.series_kernels import in_series
 from capsense.solver.gradients.gradient_kernels import jacobian
 from capsense.solver.interaction.pair_kernels import bound_images, leaf_pairs
 from capsense.solver.interaction.subpanel_kernels import add_parts
-from capsense.solver.placement.placement_kernels import Leaves, leaf_rows, placed
-from capsense.solver.placement.truncation_kernels import reached
-from capsense.solver.selection.selection_kernels import Cut, Functions, chosen, functions_of
+from capsense.solver.placement.placement_kernels import ActiveClusters, leaf_rows, placed
+from capsense.solver.placement.truncation_kernels import truncate_to_domain
+from capsense.solver.selection.selection_kernels import ActiveTree, Functions, chosen, functions_of
 from capsense.solver.system.network_kernels import (
     as_nodes,
     coarse_of,
@@ -60,9 +60,9 @@ class Solution(NamedTuple):
 
     delta: NDArray[Any]
     """Change of the Maxwell matrix [m], shape (m, m); complex where matter has losses."""
-    left: NDArray[Any]
+    residual_correction: NDArray[Any]
     """The part of it that functions outside the system stand for [m], shape (m, m)."""
-    coarse: NDArray[Any]
+    discretization_error: NDArray[Any]
     """Estimate of what panels are too coarse for, and of the gap law's error, of its diagonal [m],
     shape (m,)."""
     charge: NDArray[Any]
@@ -71,7 +71,7 @@ class Solution(NamedTuple):
     """Four points of each leaf [m], shape (l, 4, 3)."""
     extent: NDArray[Any]
     """Extent of each leaf [m], shape (l,)."""
-    soft: NDArray[Any]
+    softening_length: NDArray[Any]
     """Distance below which 1/r from its points is bounded [m], shape (l,)."""
     owner: NDArray[Any]
     """Body of each leaf, shape (l,)."""
@@ -98,7 +98,7 @@ def prepared(
     width: float,
     facing: Facing,
     scored: NDArray[np.void],
-) -> tuple[Cut, Leaves, Functions, System]:
+) -> tuple[ActiveTree, ActiveClusters, Functions, System]:
     """Choose charge functions, and set up their system.
 
     Args:
@@ -115,13 +115,13 @@ def prepared(
     cut = chosen(scored, green, threshold, width, facing)
     leaves = placed(bodies, cut, green)
     hold_apart(bodies, facing, leaves, green)
-    cut, leaves = reached(cut, leaves)
-    rows = leaf_rows(leaves.points, leaves.beyond, green)
+    cut, leaves = truncate_to_domain(cut, leaves)
+    rows = leaf_rows(leaves.points, leaves.outside_fraction, green)
     pairs = leaf_pairs(leaves, green.floor)
     add_parts(bodies, cut, leaves, pairs)
     bound_images(leaves, rows, pairs, green)
-    functions = functions_of(bodies, cut, leaves.beyond)
-    return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
+    functions = functions_of(bodies, cut, leaves.outside_fraction)
+    return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.phi_columns)
 
 
 @kernel
@@ -179,11 +179,11 @@ def _solve(
     if not soft.all():
         for b in range(bodies.shape[0]):
             if soft[b]:
-                stiff[b].softness = NOTHING
+                stiff[b].inverse_susceptibility = NOTHING
         rest = solve_lifted(stiff, green, threshold, width, False).delta
     for b in range(bodies.shape[0]):
         if soft[b]:
-            stiff[b].softness = 0.0
+            stiff[b].inverse_susceptibility = 0.0
     high = solve_lifted(stiff, green, threshold, width, False).delta
     for b in range(bodies.shape[0]):
         if soft[b]:
@@ -195,10 +195,21 @@ def _solve(
         doubt = max(doubt, SERIES * abs(delta[i, i] - found.delta[i, i]))
     found.delta[:] = delta
     return Solution(
-        found.delta, found.left, found.coarse, found.charge, found.points, found.extent, found.soft,
-        found.owner, found.size, found.shift, found.error + doubt, found.near | soft, found.node,
+        found.delta,
+        found.residual_correction,
+        found.discretization_error,
+        found.charge,
+        found.points,
+        found.extent,
+        found.softening_length,
+        found.owner,
+        found.size,
+        found.shift,
+        found.error + doubt,
+        found.near | soft,
+        found.node,
         found.weights,
-    )  # fmt: skip
+    )
 
 
 @compiled
@@ -229,13 +240,24 @@ def solve_lifted(
         add_between(placed_as, facing, node, delta)
         weights = potentials_of(delta, m, nodes, capacitance)
         delta, left = congruent(weights, delta, capacitance), congruent(weights, left, np.zeros(0))
-        charge, coarse = mixed(charge, weights, green.lead), coarse_of(coarse, weights)
+        charge, coarse = mixed(charge, weights, green.phi_columns), coarse_of(coarse, weights)
     error = estimate(delta, left, coarse[:m], shift, green.electrodes)
     return Solution(
-        delta[:m, :m], left[:m, :m], coarse[:m], charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift, error,
-        near, node, weights,
-    )  # fmt: skip
+        delta[:m, :m],
+        left[:m, :m],
+        coarse[:m],
+        charge,
+        leaves.points,
+        leaves.extent,
+        leaves.softening_length,
+        leaves.owner,
+        functions.solved,
+        shift,
+        error,
+        near,
+        node,
+        weights,
+    )
 
 
 @compiled

@@ -63,7 +63,7 @@ class System(NamedTuple):
     """Energies of those solved for [1/m], shape (n, n)."""
     rest: NDArray[Any]
     """The same of the others with those, shape (f - n, n)."""
-    own: NDArray[Any]
+    diagonal: NDArray[Any]
     """Energies of all functions by themselves [1/m], shape (f,)."""
 
 
@@ -91,7 +91,7 @@ def _differences(cut, functions, values, out, start):
     width, zero = values.shape[1], wide_splat(np.float32(0.0))
     for f in range(out.shape[0]):
         a, o = functions.cluster[f], f * out.shape[1] + start
-        x, y = (cut.kids[a, 0], cut.kids[a, 1]) if a >= 0 else (-1 - a, np.int64(-1))
+        x, y = (cut.children[a, 0], cut.children[a, 1]) if a >= 0 else (-1 - a, np.int64(-1))
         for i in range(0, width, WIDE):
             less = wide_span(values, y * width + i) if y >= 0 else zero
             put_span(out, o + i, vsub(wide_span(values, x * width + i), less))
@@ -105,11 +105,11 @@ def _climb(cut, values):
     """
     width, zero = values.shape[1], wide_splat(np.float32(0.0))
     for a in range(cut.node.shape[0] - 1, -1, -1):
-        o, x, y = a * width, cut.kids[a, 0] * width, cut.kids[a, 1] * width
+        o, x, y = a * width, cut.children[a, 0] * width, cut.children[a, 1] * width
         if x < 0 or not is_there(cut, a):
             continue
-        whole = np.float32(cut.whole[a])
-        p, q = np.float32(cut.parts[a, 0]), np.float32(cut.parts[a, 1])
+        whole = np.float32(cut.self_weight[a])
+        p, q = np.float32(cut.child_weights[a, 0]), np.float32(cut.child_weights[a, 1])
         for i in range(0, width, WIDE):
             own = madd(whole, wide_span(values, o + i), zero) if whole > 0.0 else zero
             own = madd(q, wide_span(values, y + i), own)
@@ -117,25 +117,25 @@ def _climb(cut, values):
 
 
 @compiled
-def assembled(bodies, cut, functions, rows, pairs, lead):
+def assembled(bodies, cut, functions, rows, pairs, phi_columns):
     """Set up the system of a cut from the rows (l, w) and pairs (l, l) of its leaves."""
     total, solved = functions.cluster.shape[0], functions.solved
     wide, outer = _integrals(cut, functions, rows, pairs)
-    modes = rows.shape[1] - lead
+    modes = rows.shape[1] - phi_columns
     psi = np.empty((total, modes), np.float32)
-    phi, own = np.empty((total, lead)), np.empty(total)
+    phi, own = np.empty((total, phi_columns)), np.empty(total)
     for f in range(total):
-        for i in range(lead):
+        for i in range(phi_columns):
             phi[f, i] = wide[f, i]
         for k in range(modes):
-            psi[f, k] = wide[f, lead + k]
+            psi[f, k] = wide[f, phi_columns + k]
         own[f] = -square(psi, f)
     response = _products(psi, solved)
     matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
     for f in range(total):
         if f >= solved:  # its two parts are leaves
-            parts = cut.kids[functions.cluster[f]]
-            x, y = cut.leaf[parts[0]], cut.leaf[parts[1]]
+            parts = cut.children[functions.cluster[f]]
+            x, y = cut.active_index[parts[0]], cut.active_index[parts[1]]
             own[f] += float(pairs[x, x]) + float(pairs[y, y]) - 2.0 * float(pairs[x, y])
             for e in range(solved):
                 rest[f - solved, e] = float(outer[f, e]) - float(response[f, e])
@@ -158,12 +158,12 @@ def _integrals(cut, functions, rows, pairs):
     Pairs are taken some columns at a time, so that the clusters' means stay in the processor's
     cache. The second result has a few columns too many.
     """
-    clusters, leaves, solved = cut.node.shape[0], cut.leaves.shape[0], functions.solved
+    clusters, leaves, solved = cut.node.shape[0], cut.active.shape[0], functions.solved
     total, width = functions.cluster.shape[0], rows.shape[1]
     means, wide = np.zeros((clusters, width), np.float32), np.empty((total, width), np.float32)
     for j in range(leaves):
         for i in range(width):
-            means[cut.leaves[j], i] = rows[j, i]
+            means[cut.active[j], i] = rows[j, i]
     _climb(cut, means)
     _differences(cut, functions, means, wide, np.int64(0))
     most = padded(max(_CACHED // clusters, 4 * WIDE), WIDE)
@@ -172,7 +172,7 @@ def _integrals(cut, functions, rows, pairs):
     part = np.zeros((clusters, many), np.float32)
     for start in range(0, leaves, many):
         for j in range(leaves):
-            line, o = part[cut.leaves[j]], j * leaves + start
+            line, o = part[cut.active[j]], j * leaves + start
             for i in range(min(many, leaves - start)):
                 line[i] = at(pairs, o + i)
         _climb(cut, part)
@@ -182,7 +182,7 @@ def _integrals(cut, functions, rows, pairs):
     part = np.zeros((clusters, many), np.float32)
     for start in range(0, solved, many):
         for j in range(leaves):
-            line, o = part[cut.leaves[j]], start * half.shape[1] + j
+            line, o = part[cut.active[j]], start * half.shape[1] + j
             for e in range(min(many, solved - start)):
                 line[e] = at(half, o + e * half.shape[1])
         _climb(cut, part)
@@ -227,9 +227,9 @@ def _add_matter(bodies, functions, matrix, own):
         if functions.cluster[f] < 0:
             for e in range(f + 1):
                 if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
-                    matrix[f, e] += body.tie
+                    matrix[f, e] += body.ground_elastance
         elif body.sheet > 0.0:
-            along = SHEET * body.softness / body.sheet
+            along = SHEET * body.inverse_susceptibility / body.sheet
             own[f] += along
             if f < solved:
                 matrix[f, f] += along
@@ -250,7 +250,7 @@ def reduced(functions, system, adjoint):
         if f < solved:
             root[f] = math.sqrt(fade)
         if fade < 1.0:
-            lack[f] = GAIN * (1.0 - fade) * (1.0 - (1.0 - functions.above[f]) ** 4) / own[f]
+            lack[f] = GAIN * (1.0 - fade) * (1.0 - (1.0 - functions.parent_fade[f]) ** 4) / own[f]
     factor, x = np.empty((solved, whole_lines(solved))), np.zeros((total, m))
     for f in range(solved):
         for i in range(m):
@@ -278,7 +278,7 @@ def reduced(functions, system, adjoint):
     coarse = np.zeros(m)
     for f in range(solved):
         for i in range(m):
-            coarse[i] += COARSE * functions.ends[f] * own[f] * x[f, i] ** 2
+            coarse[i] += COARSE * functions.panel_end_fraction[f] * own[f] * x[f, i] ** 2
     if adjoint:
         _add_adjoint(matrix, rest, root, lack, factor, charge, x)
     for f in range(solved, total):
@@ -355,15 +355,15 @@ def leaf_charges(cut, functions, x, leaves):
             if a < 0:
                 charge[-1 - a, i] += x[f, i]
             else:
-                charge[cut.kids[a, 0], i] += x[f, i]
-                charge[cut.kids[a, 1], i] -= x[f, i]
+                charge[cut.children[a, 0], i] += x[f, i]
+                charge[cut.children[a, 1], i] -= x[f, i]
     out = np.empty((leaves, m))
     for a in range(clusters):
-        if cut.leaf[a] >= 0:
+        if cut.active_index[a] >= 0:
             for i in range(m):
-                out[cut.leaf[a], i] = cut.whole[a] * charge[a, i]
-        if cut.kids[a, 0] >= 0:
+                out[cut.active_index[a], i] = cut.self_weight[a] * charge[a, i]
+        if cut.children[a, 0] >= 0:
             for i in range(m):
-                charge[cut.kids[a, 0], i] += cut.parts[a, 0] * charge[a, i]
-                charge[cut.kids[a, 1], i] += cut.parts[a, 1] * charge[a, i]
+                charge[cut.children[a, 0], i] += cut.child_weights[a, 0] * charge[a, i]
+                charge[cut.children[a, 1], i] += cut.child_weights[a, 1] * charge[a, i]
     return out

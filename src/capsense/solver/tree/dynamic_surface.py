@@ -237,7 +237,7 @@ OWN = 4.0
 """Energy of a charge function times the extent of its cluster, as far as scores need it."""
 
 
-class ChangingBody:
+class DynamicBody:
     """A surface of pieces as the step takes it; ``record`` points to arrays that are held here.
 
     Args:
@@ -259,14 +259,14 @@ class ChangingBody:
         self.sheet = sheet
         self.pieces = surface if isinstance(surface, PieceArrays) else None
         n = len(surface.areas)
-        self._kids, self._panel, self._function = tree.kids, tree.panel, tree.function
+        self._kids, self._panel, self._function = tree.children, tree.panel, tree.function
         if wanted is not None and not wanted.all():
             self._kids, self._panel, self._function = (
-                np.empty_like(a) for a in (tree.kids, tree.panel, tree.function)
+                np.empty_like(a) for a in (tree.children, tree.panel, tree.function)
             )
             n = tree_kernels.prune(
-                tree.kids, tree.panel, wanted, self._kids, self._panel, self._function,
-                np.empty((2, len(tree.kids)), np.int64),
+                tree.children, tree.panel, wanted, self._kids, self._panel, self._function,
+                np.empty((2, len(tree.children)), np.int64),
             )  # fmt: skip
             self._kids, self._panel, self._function = (
                 np.ascontiguousarray(a[: 2 * n - 1])
@@ -291,14 +291,14 @@ class ChangingBody:
         self._own[0] = 0.5 * OWN / extent[0]
         self._own[self._function[~single]] = OWN / extent[~single]
         record = np.zeros(1, BODY)[0]
-        record["n"], record["stored"], record["scale"] = n, nodes, 1.0
+        record["n"], record["n_panel_clusters"], record["scale"] = n, nodes, 1.0
         record["inside"] = INSIDE if sheet == 0.0 else 0.0
-        for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
+        for name in ("children", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
         self.record = record
 
     @property
-    def impedance(self) -> Array32 | None:
+    def neumann_to_dirichlet(self) -> Array32 | None:
         """What the inside has beyond ``record["inside"]`` times the energy, if that is known."""
         return None
 

@@ -24,7 +24,7 @@ from capsense.solver.bodies.blocks import free_block, impedance
 from capsense.solver.bodies.grids import box_tiles
 from capsense.solver.bodies.panels import SurfacePanels, panels_of, polygon_panels
 from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.dynamic_surface import ChangingBody
+from capsense.solver.tree.dynamic_surface import DynamicBody
 from capsense.solver.tree.mean_kernels import means_between, patch_means, points_of_each
 from capsense.solver.tree.rigid import (
     HALF_SPACE,
@@ -41,7 +41,7 @@ Array32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 WIDE = 0.16
-"""Shapes of a second-largest extent above this [m] are solved for on a :class:`WideBody`."""
+"""Shapes of a second-largest extent above this [m] are solved for on a :class:`FinePanelBody`."""
 _ROUND = {
     ShapeKind.SPHERE: math.pi / 6, ShapeKind.ELLIPSOID: math.pi / 6,
     ShapeKind.CAPSULE: math.pi / 4, ShapeKind.CYLINDER: math.pi / 4,
@@ -145,14 +145,14 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float, finest: float | 
     return _FEWEST * 2 ** min(doublings, _DOUBLINGS + 1)
 
 
-def wide_body(shape: Shape, pieces: int, conducting: bool) -> WideBody:
+def wide_body(shape: Shape, pieces: int, conducting: bool) -> FinePanelBody:
     """A wide shape, of about so many pieces."""
     panels, coarse = panels_of(shape, pieces, merge=False), _wide(shape).coarse
     if isinstance(shape, Box) and not conducting:
         tiles = box_tiles(shape.size, coarse)
         parts = panels.areas / tiles.side(panels.centers) ** 2
-        return WideBody(panels, lambda: polygon_panels(tiles.polygons()), parts)
-    return WideBody(panels, lambda: panels_of(shape, coarse))
+        return FinePanelBody(panels, lambda: polygon_panels(tiles.polygons()), parts)
+    return FinePanelBody(panels, lambda: panels_of(shape, coarse))
 
 
 def _ahead(tree: Clusters, parts: Array, count: int) -> Clusters:
@@ -163,25 +163,25 @@ def _ahead(tree: Clusters, parts: Array, count: int) -> Clusters:
         parts: What each panel counts, shape (n,).
         count: So many are not split among those that come first.
     """
-    total = np.zeros(len(tree.kids))
+    total = np.zeros(len(tree.children))
     single = tree.panel >= 0
     total[single] = parts[tree.panel[single]]
     for k in np.flatnonzero(~single)[::-1].tolist():
-        total[k] = total[tree.kids[k]].sum()
+        total[k] = total[tree.children[k]].sum()
     heap, order = [(-total[0], 0)], [0]
     while heap and len(order) < 2 * count - 1:
-        kids = tree.kids[heappop(heap)[1]].tolist()
-        if kids[0] >= 0:
-            order += kids
-            for k in kids:
+        children = tree.children[heappop(heap)[1]].tolist()
+        if children[0] >= 0:
+            order += children
+            for k in children:
                 heappush(heap, (-total[k], k))
     late = np.ones(len(total), np.bool_)
     late[order] = False
     old = np.concatenate([order, np.flatnonzero(late)])
     new = np.empty_like(old)
     new[old] = np.arange(len(old))
-    kids = np.where(tree.kids < 0, -1, new[tree.kids])[old]
-    return Clusters(kids, (kids[:, 0] + 1) // 2 - (kids[:, 0] < 0), tree.panel[old])
+    children = np.where(tree.children < 0, -1, new[tree.children])[old]
+    return Clusters(children, (children[:, 0] + 1) // 2 - (children[:, 0] < 0), tree.panel[old])
 
 
 def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
@@ -192,18 +192,18 @@ def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
     return thickness, thickness > _FLAT * low
 
 
-def _coarsest(kids: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
+def _coarsest(children: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
     """The first clusters of a tree, as far as ``count`` of them are not split among them.
 
     Returns:
         Parts of these clusters, -1 where they are not split, shape (t, 2); numbers of those that
         are not, shape (t,); and the one that each cluster of a single panel is in, shape (n,).
     """
-    top = min(2 * count - 1, len(kids))
-    first = np.where(kids[:top] < top, kids[:top], -1)
+    top = min(2 * count - 1, len(children))
+    first = np.where(children[:top] < top, children[:top], -1)
     last = first[:, 0] < 0
-    parent = np.zeros(len(kids), np.int64)
-    parent[kids[panel < 0]] = np.flatnonzero(panel < 0)[:, None]
+    parent = np.zeros(len(children), np.int64)
+    parent[children[panel < 0]] = np.flatnonzero(panel < 0)[:, None]
     above = np.flatnonzero(panel >= 0)
     while (below := above >= top).any():
         above[below] = parent[above[below]]
@@ -227,7 +227,7 @@ def _equilibrium(panels: SurfacePanels, cluster: Ints) -> Array:
     )
 
 
-class WideBody(ChangingBody):
+class FinePanelBody(DynamicBody):
     """A rigid shape on many panels, which meet each other without a block of energies.
 
     Args:
@@ -256,25 +256,28 @@ class WideBody(ChangingBody):
         tree = split(self._at, panels.areas)
         if parts is not None:
             tree = _ahead(tree, parts, _FINER)
-        kids, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)
+        children, number, above = _coarsest(tree.children, tree.panel, _CLUSTERS)
         cluster = np.empty(len(panels), np.int64)
         cluster[tree.panel[tree.panel >= 0]] = number[above]
         self.weights = _equilibrium(panels, cluster)
         super().__init__(tree, panels, charge=self.weights)
         self._points, self._soft = points_of_each(self._center, self._spread)
-        for name in ("points", "soft"):  # the body is rigid: they are needed at every step
+        for name in (
+            "points",
+            "softening_length",
+        ):  # the body is rigid: they are needed at every step
             self.record[name] = getattr(self, f"_{name}").ctypes.data
         last = np.flatnonzero(number >= 0)
         # of rectangles: these stand badly for larger clusters, which may be bent or have limbs
         near = means_between(self._points[last])
-        self._means = tree_kernels.means_of_clusters(near, last, kids, self._charge)
+        self._means = tree_kernels.means_of_clusters(near, last, children, self._charge)
         """Means of 1/r within the body's first clusters, row by row up to the diagonal [1/m]."""
         self.record["inside"] = HALF_SPACE
-        self.record["means"], self.record["top"] = self._means.ctypes.data, len(kids)
+        self.record["means"], self.record["top"] = self._means.ctypes.data, len(children)
 
     @property
-    def impedance(self) -> Array32:
-        """As in :class:`ChangingBody`, shape (f, f).
+    def neumann_to_dirichlet(self) -> Array32:
+        """As in :class:`DynamicBody`, shape (f, f).
 
         Z − 2F is smooth: charges within a small place that add to zero have none of it. So it is
         that of a few panels, for the charge functions of clusters as large as these and larger.
@@ -286,12 +289,12 @@ class WideBody(ChangingBody):
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
             free = free_block(panels)
             more = impedance(panels, free) - HALF_SPACE * free
-        kids, number, above = _coarsest(self._kids, self._panel, len(panels))
+        children, number, above = _coarsest(self._kids, self._panel, len(panels))
         single = np.flatnonzero(self._panel >= 0)
         on = cKDTree(features(panels.centers, panels.normals, self.most)).query(self._at)[1]
         share = self._charge[single] / self._charge[above]
         places = number[above], on[self._panel[single]]
         shares = csr_array((share, places), (number.max() + 1, len(panels)))
         block = np.ascontiguousarray(shares @ (shares @ more).T)
-        tree = kids, number, self._charge[: len(kids)], self._function[: len(kids)]
+        tree = children, number, self._charge[: len(children)], self._function[: len(children)]
         return tree_kernels.table_of_functions(block, *tree)

@@ -16,7 +16,7 @@ from capsense.scene.geometry_kernels import parted
 from capsense.scene.materials import Grounding, Material
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import ShapeKind
-from capsense.solver.tree.dynamic_surface import ChangingBody
+from capsense.solver.tree.dynamic_surface import DynamicBody
 from capsense.solver.tree.rigid import HALF_SPACE, RigidShape
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ _BOUND = 300.0, 3000.0
 """Real permittivities between which displacement current comes to tie a body to ground."""
 _CONTACT = 6.0
 """Size of a body over that of the contact that ties it to ground."""
-SHUT = 1e8
+FLOATING_PENALTY = 1e8
 """Energy [1/m] of the net charge of conductors that touch each other and float together."""
 _UNSEEN = TriMesh | Layers | SurfaceMesh
 """Shapes that are not looked at when it is asked which conductors touch."""
@@ -76,7 +76,7 @@ class Matter:
         return bool(((self.eps.imag != 0) & ~self.conducting).any())
 
     @cached_property
-    def softness(self) -> Complex:
+    def inverse_susceptibility(self) -> Complex:
         """1 / (eps - 1), zero for conductors, shape (n,)."""
         out = np.zeros(len(self.eps), complex)
         soft = ~self.conducting
@@ -153,23 +153,31 @@ class Matter:
             return self
         return _repeated(self, tuple(places))
 
-    def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
+    def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | DynamicBody]) -> None:
         """Enter what the kernels need to know; losses are left to ``lossy.solve_lossy``."""
-        ties, softness = self.ties(sizes_of(records, shapes)), self.softness
+        ties, inverse_susceptibility = (
+            self.ties(sizes_of(records, shapes)),
+            self.inverse_susceptibility,
+        )
         members = np.bincount(self.group, minlength=len(records))[self.group]
         none = np.isinf(ties.real)
         shared = none & (members > 1) & self.conducting
         records["neutral"] = none & ~shared
-        records["tie"] = np.where(shared, SHUT, np.where(none, 0.0, ties.real))
-        records["group"], records["softness"] = self.group, softness.real
-        records["stiffer"] = HALF_SPACE * np.abs(softness)
-        for k in np.flatnonzero(softness).tolist():
+        records["ground_elastance"] = np.where(
+            shared, FLOATING_PENALTY, np.where(none, 0.0, ties.real)
+        )
+        records["group"], records["inverse_susceptibility"] = (
+            self.group,
+            inverse_susceptibility.real,
+        )
+        records["polarization_stiffness"] = HALF_SPACE * np.abs(inverse_susceptibility)
+        for k in np.flatnonzero(inverse_susceptibility).tolist():
             shape = shapes[k]
-            block = shape.impedance
+            block = shape.neumann_to_dirichlet
             if block is not None:  # `.ctypes` takes much longer
-                records["impedance"][k] = block.__array_interface__["data"][0]
-                records["known"][k] = len(block)
-            if isinstance(shape, ChangingBody):
+                records["neumann_to_dirichlet"][k] = block.__array_interface__["data"][0]
+                records["n_tabulated"][k] = len(block)
+            if isinstance(shape, DynamicBody):
                 records["sheet"][k] = shape.sheet
 
 
@@ -206,7 +214,7 @@ def _repeated(matter: Matter, places: tuple[int, ...]) -> Matter:
     )
 
 
-def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> Array:
+def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | DynamicBody]) -> Array:
     """Capacitances of bodies in free space over 4π eps0 [m], shape (n,)."""
     return records["scale"] * np.array([s.capacitance for s in shapes])
 

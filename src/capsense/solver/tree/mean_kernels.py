@@ -43,7 +43,7 @@ _UPON = 0.1
 
 
 @kernel
-def four_points(a, center, v, out):
+def quadrature4(a, center, v, out):
     """Four points of equal weight with a centre and the two largest of its second moments.
 
     Args:
@@ -101,7 +101,7 @@ def points_of_each(center, spread):
         for i in range(3):
             for j in range(3):
                 moments[i, j] = spread[k, i, j]
-        _, soft[k] = four_points(moments, center[k], turn, points[k])
+        _, soft[k] = quadrature4(moments, center[k], turn, points[k])
     return points, soft
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled
 from capsense.design.film import Film
 from capsense.scene.geometry_kernels import Boxes, enclosed
-from capsense.solver.tree.dynamic_surface import STEP_SLOPE, ChangingBody, PieceArrays
+from capsense.solver.tree.dynamic_surface import STEP_SLOPE, DynamicBody, PieceArrays
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,7 +35,7 @@ class Face(NamedTuple):
 
 
 def near_triangles(
-    body: ChangingBody, record: np.void, face: Face, near: float, reach: float
+    body: DynamicBody, record: np.void, face: Face, near: float, reach: float
 ) -> Boxes | None:
     """Triangles of a surface within ``reach`` [m] of a face; None if all are farther than ``near``.
 

@@ -51,12 +51,14 @@ LEAST_CHARGE = 1e-6
 BODY = np.dtype(
     [
         ("n", np.int64),  # panels, or parts of them; there are 2 n - 1 clusters
-        ("stored", np.int64),  # the first so many of these are no parts of panels
-        ("kids", np.int64), ("function", np.int64), ("charge", np.int64), ("center", np.int64),
-        ("points", np.int64), ("extent", np.int64), ("soft", np.int64), ("own", np.int64),
-        ("energy", np.int64),
-        ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
-        ("known", np.int64),  # functions that have energies and impedances there, the first ones
+        ("n_panel_clusters", np.int64),  # the first so many of these are no parts of panels
+        ("children", np.int64), ("function", np.int64), ("charge", np.int64), ("center", np.int64),
+        ("points", np.int64), ("extent", np.int64), ("own", np.int64),
+        ("softening_length", np.int64),
+        ("potential_coefficients", np.int64),
+        ("neumann_to_dirichlet", np.int64),  # all of these: where the arrays of a RigidShape stand
+        # functions that have energies and impedances there, the first ones
+        ("n_tabulated", np.int64),
         ("spread", np.int64),  # second moments of a changing surface, which has no points, else 0
         ("means", np.int64), ("top", np.int64),  # means of 1/r within its first so many clusters
         ("outline", np.int64), ("closed", np.int64),  # code of the outline; whether it is closed
@@ -68,11 +70,13 @@ BODY = np.dtype(
         ("sunk", np.float64),  # how far below that it stands in a cover [m], once it is pressed out
         ("neutral", np.int64),  # whether it carries no net charge
         ("group", np.int64),  # bodies that touch are one conductor, named by its first body
-        ("tie", np.float64),  # energy of a group's net charge beyond that of its field [1/m]
+        # energy of a group's net charge beyond that of its field [1/m]
+        ("ground_elastance", np.float64),
         ("inside", np.float64),  # impedance of its inside, over its energy; 0 for a sheet
         ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
-        ("softness", np.float64),  # 1 / (eps - 1), 0 for a conductor
-        ("stiffer", np.float64),  # about what its inside adds to energies, over them, as it scores
+        ("inverse_susceptibility", np.float64),  # 1 / (eps - 1), 0 for a conductor
+        # about what its inside adds to energies, over them, as it scores
+        ("polarization_stiffness", np.float64),
     ]
 )  # fmt: skip
 """One body, as the kernels take it."""
@@ -82,7 +86,7 @@ BODY = np.dtype(
 class Clusters:
     """A binary tree of clusters, breadth first; n panels make 2 n - 1 of them."""
 
-    kids: Ints
+    children: Ints
     """The two parts of each cluster, -1 for a single panel, shape (2 n - 1, 2)."""
     function: Ints
     """Charge function that splits a cluster, -1 for a single panel, shape (2 n - 1,)."""
@@ -103,7 +107,7 @@ class Tree(Clusters):
     shape (2 n - 1, 4, 3)."""
     extent: Array
     """Length of a uniform rod with the cluster's largest second moment [m], shape (2 n - 1,)."""
-    soft: Array
+    softening_length: Array
     """Distance below which 1/r from the points is bounded [m], shape (2 n - 1,)."""
 
 
@@ -122,7 +126,7 @@ class RigidShape(Frozen):
 
     panels: SurfacePanels
     tree: Tree
-    energy: Array32
+    potential_coefficients: Array32
     """Mean potential of one charge function on another, free space [1/m], shape (n, n)."""
     capacitance: float
     """Capacitance in free space over 4π eps0 [m]."""
@@ -135,21 +139,32 @@ class RigidShape(Frozen):
     @property
     def own(self) -> Array:
         """Diagonal of ``energy`` [1/m], shape (n,)."""
-        return once(self, "_own", lambda: np.diag(self.energy).astype(float))
+        return once(self, "_own", lambda: np.diag(self.potential_coefficients).astype(float))
 
     @cached_property
     def record(self) -> np.void:
         """What the kernels take of a body that its shape tells; points to arrays held here."""
         record = np.zeros(1, BODY)[0]
-        record["n"] = record["known"] = len(self.panels)
-        record["stored"] = 2 * len(self.panels) - 1
-        record["energy"], record["own"] = self.energy.ctypes.data, self.own.ctypes.data
-        for name in ("kids", "function", "charge", "center", "points", "extent", "soft"):
+        record["n"] = record["n_tabulated"] = len(self.panels)
+        record["n_panel_clusters"] = 2 * len(self.panels) - 1
+        record["potential_coefficients"], record["own"] = (
+            self.potential_coefficients.ctypes.data,
+            self.own.ctypes.data,
+        )
+        for name in (
+            "children",
+            "function",
+            "charge",
+            "center",
+            "points",
+            "extent",
+            "softening_length",
+        ):
             record[name] = getattr(self.tree, name).ctypes.data
         return record
 
     @property
-    def impedance(self) -> Array32:
+    def neumann_to_dirichlet(self) -> Array32:
         """Interior impedance Z of the charge functions [1/m], shape (n, n).
 
         A body of permittivity eps adds ``Z / (eps - 1)`` to ``energy``. That of an open surface is
@@ -159,7 +174,7 @@ class RigidShape(Frozen):
 
     def _inside(self) -> Array32:
         if not self.panels.closed:
-            z = np.float32(INSIDE) * self.energy
+            z = np.float32(INSIDE) * self.potential_coefficients
             z[0] = z[:, 0] = 0.0
             return z
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
@@ -170,7 +185,7 @@ class RigidShape(Frozen):
     def nbytes(self) -> int:
         """Room that the matrices take up [bytes]."""
         z = self.__dict__.get("_impedance")
-        return self.energy.nbytes + (0 if z is None else z.nbytes)
+        return self.potential_coefficients.nbytes + (0 if z is None else z.nbytes)
 
 
 def rigid_shape(panels: SurfacePanels, *, apart: bool = False, most: float = np.inf) -> RigidShape:
@@ -287,15 +302,15 @@ def features(centers: Array, normals: Array, most: float = np.inf) -> Array:
 
 def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tree:
     """Clusters of panels with their charges (n,) entered."""
-    n, kids, panel = len(panels), clusters.kids, clusters.panel
+    n, children, panel = len(panels), clusters.children, clusters.panel
     single = panel >= 0
     share, center = np.empty(2 * n - 1), np.empty((2 * n - 1, 3))
     spread = np.empty((2 * n - 1, 3, 3))
     share[single] = charge[panel[single]] / charge.sum()
     center[single], spread[single] = panels.centers[panel[single]], panels.moments[panel[single]]
-    tree_kernels.moments(kids, panel, share, center, spread)
+    tree_kernels.moments(children, panel, share, center, spread)
     points, extent, soft = four_points_of(center, spread)
-    return Tree(kids, clusters.function, panel, share, center, points, extent, soft)
+    return Tree(children, clusters.function, panel, share, center, points, extent, soft)
 
 
 def four_points_of(center: Array, spread: Array) -> tuple[Array, Array, Array]:
@@ -318,14 +333,16 @@ def split(features: Array, charge: Array) -> Clusters:
     """Split panels into clusters by their centres and scaled normals (n, 6) and charges (n,)."""
     n = len(features)
     order, first, last = np.empty(n, np.int64), *np.empty((2, 2 * n - 1), np.int64)
-    kids = np.empty((2 * n - 1, 2), np.int64)
+    children = np.empty((2 * n - 1, 2), np.int64)
     grain = _GRAIN * float(np.ptp(features[:, :3], axis=0).max())
-    tree_kernels.split(np.round(features / grain), charge, order, first, last, kids)
-    single = kids[:, 0] < 0
+    tree_kernels.split(np.round(features / grain), charge, order, first, last, children)
+    single = children[:, 0] < 0
     panel = np.where(single, order[first], -1)
-    return Clusters(kids, np.where(single, -1, np.cumsum(~single)), panel)
+    return Clusters(children, np.where(single, -1, np.cumsum(~single)), panel)
 
 
 def _of_functions(tree: Tree, block: Array) -> Array32:
     """Change a symmetric block of panels, which is lost, to one of charge functions."""
-    return tree_kernels.table_of_functions(block, tree.kids, tree.panel, tree.charge, tree.function)
+    return tree_kernels.table_of_functions(
+        block, tree.children, tree.panel, tree.charge, tree.function
+    )

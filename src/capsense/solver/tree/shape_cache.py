@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._thread_pool import OneAtATime
+from capsense._thread_pool import ForkSafeRLock
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
 from capsense.scene import (
@@ -33,8 +33,8 @@ from capsense.scene import (
 from capsense.scene.shapes import ShapeKind
 from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import panels_of, polygon_panels
-from capsense.solver.tree.dynamic_surface import ChangingBody, layer_pieces, mesh_pieces
-from capsense.solver.tree.fine_panels import FACES, WideBody, wide_body, wide_pieces
+from capsense.solver.tree.dynamic_surface import DynamicBody, layer_pieces, mesh_pieces
+from capsense.solver.tree.fine_panels import FACES, FinePanelBody, wide_body, wide_pieces
 from capsense.solver.tree.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.solver.tree.subpanels import refined
 
@@ -46,7 +46,7 @@ _GRID = 1e-5
 difference."""
 
 
-class Standing(NamedTuple):
+class PrincipalFrame(NamedTuple):
     """A mesh in its own frame; ``x @ axes.T + middle`` leads back to the frame given."""
 
     corners: Array
@@ -57,7 +57,7 @@ class Standing(NamedTuple):
     """Its origin, the centroid of the surface [m], shape (3,)."""
 
 
-def standing(vertices: Array, faces: NDArray[np.int64]) -> Standing:
+def standing(vertices: Array, faces: NDArray[np.int64]) -> PrincipalFrame:
     """Bring a mesh to the principal axes of its surface, its triangles sorted.
 
     The frame and the order in which a mesh is given do not matter then, unless it is symmetric:
@@ -89,7 +89,7 @@ def standing(vertices: Array, faces: NDArray[np.int64]) -> Standing:
     place = np.argsort(order)[faces]
     turn = (place.argmin(axis=1)[:, None] + np.arange(3)) % 3
     place = np.take_along_axis(place, turn, axis=1)
-    return Standing(grid * own[order][place[np.lexsort(place.T[::-1])]], axes, middle)
+    return PrincipalFrame(grid * own[order][place[np.lexsort(place.T[::-1])]], axes, middle)
 
 
 VERSION = 9
@@ -115,10 +115,10 @@ _EACH = 0.2
 _MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
-_LOCK = OneAtATime()
-_SHAPES: OrderedDict[Hashable, RigidShape | ChangingBody] = OrderedDict()
+_LOCK = ForkSafeRLock()
+_SHAPES: OrderedDict[Hashable, RigidShape | DynamicBody] = OrderedDict()
 
-T = TypeVar("T", bound=RigidShape | ChangingBody)
+T = TypeVar("T", bound=RigidShape | DynamicBody)
 
 
 def functions_of(
@@ -128,7 +128,7 @@ def functions_of(
     conducting: bool,
     largest: float | None = None,
     finest: float | None = None,
-) -> tuple[RigidShape | ChangingBody, float]:
+) -> tuple[RigidShape | DynamicBody, float]:
     """Charge functions of any shape from about ``count`` panels, and its size [m].
 
     Args:
@@ -141,10 +141,10 @@ def functions_of(
             None for none of them.
     """
     if isinstance(shape, Layers):
-        return ChangingBody(*layer_pieces(shape)), 1.0
+        return DynamicBody(*layer_pieces(shape)), 1.0
     if isinstance(shape, SurfaceMesh):
         sheet = 0.0 if shape.closed else shape.rest.thickness
-        return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
+        return DynamicBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest, finest)):
         return in_pieces(shape, pieces, conducting)
     if not conducting:
@@ -185,10 +185,10 @@ def _conductor_of(whole: Shape, count: int, _: str) -> RigidShape:
     return rigid_shape(panels, apart=True, most=FACES * panels.thickness)
 
 
-def in_pieces(shape: Shape, count: int, conducting: bool) -> tuple[ChangingBody, float]:
+def in_pieces(shape: Shape, count: int, conducting: bool) -> tuple[DynamicBody, float]:
     """The same of a wide shape, of so many pieces without energies of their own."""
 
-    def make(whole: Shape, count: int, name: str) -> WideBody:
+    def make(whole: Shape, count: int, name: str) -> FinePanelBody:
         made = wide_body(whole, count, conducting)
         made.keep = lambda block: _inside_of(f"{name}-inside", block)
         return made
@@ -307,7 +307,7 @@ def _turned(shape: RigidShape, axes: Array, middle: Array) -> RigidShape:
     old = shape.panels
     panels = polygon_panels(old.corners @ axes.T + middle, old.parts, old.closed)
     tree = charged_tree(panels, shape.tree, _charges(shape))
-    return RigidShape(panels, tree, shape.energy, shape.capacitance)
+    return RigidShape(panels, tree, shape.potential_coefficients, shape.capacitance)
 
 
 def _charges(shape: RigidShape) -> Array:
@@ -323,13 +323,19 @@ def _packed(shape: RigidShape, key: str) -> tuple[dict[str, NDArray[Any]], dict[
     panels, tree = shape.panels, shape.tree
     arrays: dict[str, NDArray[Any]] = {
         "corners": panels.corners[:, :3],
-        "parts": panels.parts.astype(np.int32), "kids": tree.kids.astype(np.int32),
-        "function": tree.function.astype(np.int32), "panel": tree.panel.astype(np.int32),
-        "charge": _charges(shape), "energy": shape.energy[np.tril_indices(len(panels))],
-    }  # fmt: skip
+        "parts": panels.parts.astype(np.int32),
+        "children": tree.children.astype(np.int32),
+        "function": tree.function.astype(np.int32),
+        "panel": tree.panel.astype(np.int32),
+        "charge": _charges(shape),
+        "potential_coefficients": shape.potential_coefficients[np.tril_indices(len(panels))],
+    }
     return arrays, {
-        "kind": "shape", "key": key, "closed": panels.closed, "capacitance": shape.capacitance,
-    }  # fmt: skip
+        "kind": "shape",
+        "key": key,
+        "closed": panels.closed,
+        "capacitance": shape.capacitance,
+    }
 
 
 def _from_lower(values: Array32, n: int) -> Array32:
@@ -343,8 +349,8 @@ def _from_lower(values: Array32, n: int) -> Array32:
 def _unpacked(arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> RigidShape:
     corners = arrays["corners"][:, [0, 1, 2, 2]]
     panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
-    clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))
-    energy = _from_lower(arrays["energy"], len(panels))
+    clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("children", "function", "panel")))
+    energy = _from_lower(arrays["potential_coefficients"], len(panels))
     return RigidShape(
         panels, charged_tree(panels, clusters, arrays["charge"]), energy,
         float(meta["capacitance"]),

@@ -40,9 +40,9 @@ class RefinedShape(RigidShape):
     """Where they lie: panels of a round shape go through it, its parts are moved onto it."""
 
     @property
-    def impedance(self) -> NDArray[np.float32]:
+    def neumann_to_dirichlet(self) -> NDArray[np.float32]:
         """As of :class:`RigidShape`, of the functions of whole panels."""
-        return self.whole.impedance
+        return self.whole.neumann_to_dirichlet
 
     @cached_property
     def _parts(self) -> dict[str, NDArray[Any]]:
@@ -52,7 +52,7 @@ class RefinedShape(RigidShape):
     def record(self) -> np.void:
         """As of :class:`RigidShape`; clusters and functions of parts follow those of panels."""
         record = self.whole.record.copy()
-        record["n"] = (len(self._parts["kids"]) + 1) // 2
+        record["n"] = (len(self._parts["children"]) + 1) // 2
         record["inside"] = HALF_SPACE
         for name, values in self._parts.items():
             record[name] = values.ctypes.data
@@ -79,7 +79,13 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
     if _sides(_flat(shape.panels)[0]).max() <= finest:
         return shape
     return RefinedShape(
-        shape.panels, shape.tree, shape.energy, shape.capacitance, shape, finest, surface
+        shape.panels,
+        shape.tree,
+        shape.potential_coefficients,
+        shape.capacitance,
+        shape,
+        finest,
+        surface,
     )
 
 
@@ -111,13 +117,13 @@ def halved(corners: Array, finest: float) -> tuple[Array, Ints, Ints]:
         Corners of the panels and all their parts, shape (2, 4, k); the parts of each, -1 where it
         has none, shape (k, 2); and the panel that it lies in, shape (k,).
     """
-    levels, kids, panel, count = [corners], [], [np.arange(corners.shape[2])], corners.shape[2]
+    levels, children, panel, count = [corners], [], [np.arange(corners.shape[2])], corners.shape[2]
     for level in range(_MOST + 1):
         sides = _sides(levels[-1])
         long = np.flatnonzero((sides.max(axis=0) > finest) & (level < _MOST))
         parts = np.full((sides.shape[1], 2), -1)
         parts[long] = count + np.arange(2 * len(long)).reshape(-1, 2)
-        kids.append(parts)
+        children.append(parts)
         if not len(long):
             break
         count += 2 * len(long)
@@ -129,7 +135,7 @@ def halved(corners: Array, finest: float) -> tuple[Array, Ints, Ints]:
         both = np.stack([np.stack([a, near, far, d], 1), np.stack([near, b, c, far], 1)], axis=3)
         levels.append(both.reshape(2, 4, -1))
         panel.append(np.repeat(panel[-1][long], 2))
-    return np.concatenate(levels, axis=2), np.concatenate(kids), np.concatenate(panel)
+    return np.concatenate(levels, axis=2), np.concatenate(children), np.concatenate(panel)
 
 
 def _moments(corners: Array) -> tuple[Array, Array, Array]:
@@ -152,7 +158,7 @@ def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
     """What a record points to of a shape's clusters and, behind them, of its panels' parts."""
     panels, tree, m = shape.panels, shape.tree, len(shape.panels)
     flat, axes = _flat(panels)
-    corners, kids, panel = halved(flat, shape.finest)
+    corners, children, panel = halved(flat, shape.finest)
     area, center, (xx, yy, xy) = _moments(corners[:, :, m:])
     axes, middle = axes[:, panel[m:]], panels.centers[panel[m:]]
     # the four points of each, as ``rigid.four_points_of`` finds them
@@ -172,21 +178,21 @@ def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
         centers = points.mean(axis=1)
     place = np.arange(len(panel)) + m - 1  # clusters of panels and parts
     place[tree.panel[tree.panel >= 0]] = np.flatnonzero(tree.panel >= 0)
-    cut = np.flatnonzero(kids[:, 0] >= 0)
-    all_kids = np.concatenate([tree.kids, np.full((len(area), 2), -1)])
-    all_kids[place[cut]] = place[kids[cut]]
+    cut = np.flatnonzero(children[:, 0] >= 0)
+    all_kids = np.concatenate([tree.children, np.full((len(area), 2), -1)])
+    all_kids[place[cut]] = place[children[cut]]
     function = np.concatenate([tree.function, np.full(len(area), -1)])
     function[place[cut]] = m + np.arange(len(cut))
     density = tree.charge[place[:m]] / panels.areas
     extent = math.sqrt(12.0) * long
     size = np.concatenate([tree.extent, extent])
     return {
-        "kids": all_kids, "function": function, "extent": size,
+        "children": all_kids, "function": function, "extent": size,
         "own": np.concatenate([shape.own, OWN / size[place[cut]]]),
         "charge": np.concatenate([tree.charge, density[panel[m:]] * area]),
         "center": np.concatenate([tree.center, centers]),
         "points": np.concatenate([tree.points, points]),
-        "soft": np.concatenate([tree.soft, SOFT * extent]),
+        "softening_length": np.concatenate([tree.softening_length, SOFT * extent]),
     }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ _SHARP = 0.3
 
 
 @compiled
-def split(features, charges, order, first, last, kids):
+def split(features, charges, order, first, last, children):
     """Split a surface into a binary tree of clusters, breadth first.
 
     A cluster is split across the feature that varies most: in the middle of its extent along a
@@ -29,11 +29,11 @@ def split(features, charges, order, first, last, kids):
     Args:
         features: Centres and scaled normals of the panels in whole numbers of some grain, shape
             (n, 6).
-        charges: Equilibrium charges of the panels, shape (n,).
-        order: Filled with the panels, those of a cluster side by side, shape (n,).
-        first: Filled with the first place in ``order`` of each cluster, shape (2 n - 1,).
-        last: Filled with the place behind the last one, shape (2 n - 1,).
-        kids: Filled with the two parts of each cluster, -1 for a single panel, shape (2 n - 1, 2).
+        charges: Equilibrium charges of the panels, shape (n,). order: Filled with the panels, those
+        of a cluster side by side, shape (n,). first: Filled with the first place in ``order`` of
+        each cluster, shape (2 n - 1,). last: Filled with the place behind the last one, shape (2 n
+        - 1,). children: Filled with the two parts of each cluster, -1 for a single panel, shape (2
+        n - 1, 2).
     """
     n = features.shape[0]
     for i in range(n):
@@ -43,7 +43,7 @@ def split(features, charges, order, first, last, kids):
     values, room, ends = np.empty(n), np.empty(n, np.int64), np.empty((2, 6))
     while k < made:
         a, b = first[k], last[k]
-        kids[k, 0] = kids[k, 1] = -1
+        children[k, 0] = children[k, 1] = -1
         if b - a > 1:
             ends[0], ends[1] = np.inf, -np.inf
             for i in range(a, b):
@@ -62,7 +62,7 @@ def split(features, charges, order, first, last, kids):
             else:
                 _sort(values[a:b], order[a:b])
                 cut = _cut(values[a:b], order[a:b], charges, k % 2 == 1)
-            kids[k, 0], kids[k, 1] = made, made + 1
+            children[k, 0], children[k, 1] = made, made + 1
             first[made], last[made] = a, a + cut
             first[made + 1], last[made + 1] = a + cut, b
             made += 2
@@ -161,16 +161,16 @@ def _cut(values, members, charges, last):
 
 
 @kernel
-def moments(kids, panel, charge, center, spread):
+def moments(children, panel, charge, center, spread):
     """Charge, centre of charge and second central moments of all clusters, from their parts.
 
     ``panel`` is the panel of a cluster without parts, whose row of ``charge``, ``center`` and
     ``spread`` is filled; the others are written.
     """
-    for k in range(kids.shape[0] - 1, -1, -1):
-        if kids[k, 0] < 0:
+    for k in range(children.shape[0] - 1, -1, -1):
+        if children[k, 0] < 0:
             continue
-        a, b = kids[k, 0], kids[k, 1]
+        a, b = children[k, 0], children[k, 1]
         whole = charge[a] + charge[b]
         p, q = charge[a] / whole, charge[b] / whole
         charge[k] = whole
@@ -186,51 +186,51 @@ def moments(kids, panel, charge, center, spread):
 
 
 @kernel
-def _upwards(kids, order):
+def _upwards(children, order):
     """Clusters such that parts come before their cluster, and no others between.
 
     Args:
-        kids: Parts of the clusters, shape (t, 2).
+        children: Parts of the clusters, shape (t, 2).
         order: Filled with the clusters, shape (t,).
 
     Returns:
         How many clusters at most wait for the other part of theirs.
     """
-    count = kids.shape[0]
+    count = children.shape[0]
     order[0], waiting = 0, 1
     for place in range(count - 1, -1, -1):  # clusters that wait stand first, done ones last
         waiting -= 1
         k = order[waiting]
-        if kids[k, 0] >= 0:
+        if children[k, 0] >= 0:
             for c in range(2):
-                order[waiting] = kids[k, c]
+                order[waiting] = children[k, c]
                 waiting += 1
         order[place] = k
     most = 0
     for k in order:
-        waiting += 1 if kids[k, 0] < 0 else -1
+        waiting += 1 if children[k, 0] < 0 else -1
         most = max(most, waiting)
     return most
 
 
 @compiled
-def to_functions(values, kids, panel, charge, function, out):
+def to_functions(values, children, panel, charge, function, out):
     """Integrate columns of panel values with every charge function, some columns at a time.
 
     Args:
         values: Mean values on the panels, shape (n, k).
-        kids: Parts of the clusters, shape (2 n - 1, 2).
+        children: Parts of the clusters, shape (2 n - 1, 2).
         panel: Panel of a cluster without parts, shape (2 n - 1,).
         charge: Charges of the clusters, shape (2 n - 1,).
         function: Number of a cluster's function, -1 for a single panel, shape (2 n - 1,).
         out: Filled, function 0 with the mean over the body, shape (n, k).
     """
-    order = np.empty(kids.shape[0], np.int64)
-    means = np.empty((_upwards(kids, order), _COLUMNS))
+    order = np.empty(children.shape[0], np.int64)
+    means = np.empty((_upwards(children, order), _COLUMNS))
     for start in range(0, values.shape[1], _COLUMNS):
         width, top = min(_COLUMNS, values.shape[1] - start), 0
         for k in order:
-            if kids[k, 0] < 0:
+            if children[k, 0] < 0:
                 line, mean = values[panel[k]], means[top]
                 for c in range(width):
                     mean[c] = line[start + c]
@@ -238,7 +238,7 @@ def to_functions(values, kids, panel, charge, function, out):
                 continue
             top -= 1
             first, second, line = means[top - 1], means[top], out[function[k]]
-            share = charge[kids[k, 0]] / charge[k]
+            share = charge[children[k, 0]] / charge[k]
             for c in range(width):
                 line[start + c] = first[c] - second[c]
             for c in range(width):
@@ -248,25 +248,25 @@ def to_functions(values, kids, panel, charge, function, out):
 
 
 @compiled
-def table_of_functions(block, kids, panel, charge, function):
+def table_of_functions(block, children, panel, charge, function):
     """Integrate a symmetric table of panel values with every charge function, both ways.
 
     Args:
         block: Mean values between panels, shape (n, n); lost.
-        kids, panel, charge, function: As in :func:`to_functions`.
+        children, panel, charge, function: As in :func:`to_functions`.
 
     Returns:
         Symmetric to the last bit, shape (n, n), single precision.
     """
     n = block.shape[0]
     rows, out = np.empty((n, n)), np.empty((n, n), np.float32)
-    to_functions(block, kids, panel, charge, function, rows)
+    to_functions(block, children, panel, charge, function, rows)
     for start in range(0, n, _BLOCK):  # blocks stay in the cache while they are turned
         for low in range(0, start + 1, _BLOCK):
             for i in range(start, min(start + _BLOCK, n)):
                 for j in range(low, min(low + _BLOCK, i)):
                     rows[i, j], rows[j, i] = rows[j, i], rows[i, j]
-    to_functions(rows, kids, panel, charge, function, block)
+    to_functions(rows, children, panel, charge, function, block)
     for i in range(n):
         for j in range(i + 1):
             out[i, j] = block[i, j]
@@ -275,26 +275,26 @@ def table_of_functions(block, kids, panel, charge, function):
 
 
 @compiled
-def means_of_clusters(means, last, kids, charge):
+def means_of_clusters(means, last, children, charge):
     """Means between clusters from those between the smallest ones.
 
     Args:
         means: Of a symmetric function, between clusters without parts here, shape (k, k).
         last: Which clusters these are, shape (k,).
-        kids: Parts of the clusters, behind them; -1 for none, shape (t, 2).
+        children: Parts of the clusters, behind them; -1 for none, shape (t, 2).
         charge: Charges of the clusters, shape (t,).
 
     Returns:
         Row by row up to the diagonal, shape (t (t + 1) / 2,).
     """
-    count, many = kids.shape[0], last.shape[0]
+    count, many = children.shape[0], last.shape[0]
     rows, share = np.empty((count, many), np.float32), np.empty(count, np.float32)
     for j in range(many):
         rows[last[j]] = means[j]
     for a in range(count - 1, -1, -1):
-        if kids[a, 0] >= 0:
-            first, second, mean = rows[kids[a, 0]], rows[kids[a, 1]], rows[a]
-            share[a] = charge[kids[a, 0]] / charge[a]
+        if children[a, 0] >= 0:
+            first, second, mean = rows[children[a, 0]], rows[children[a, 1]], rows[a]
+            share[a] = charge[children[a, 0]] / charge[a]
             for j in range(many):
                 mean[j] = second[j] + share[a] * (first[j] - second[j])
     out = np.empty(count * (count + 1) // 2, np.float32)
@@ -306,8 +306,8 @@ def means_of_clusters(means, last, kids, charge):
             for c in range(width):
                 line[c] = rows[start + c, j]
         for k in range(count - 1, -1, -1):
-            if kids[k, 0] >= 0:
-                first, second, line = lines[kids[k, 0]], lines[kids[k, 1]], lines[k]
+            if children[k, 0] >= 0:
+                first, second, line = lines[children[k, 0]], lines[children[k, 1]], lines[k]
                 for c in range(WIDE):
                     line[c] = second[c] + share[k] * (first[c] - second[c])
         for c in range(width):
@@ -318,11 +318,11 @@ def means_of_clusters(means, last, kids, charge):
 
 
 @kernel
-def prune(kids, panel, wanted, new_kids, new_panel, function, room):
+def prune(children, panel, wanted, new_kids, new_panel, function, room):
     """Leave out panels: clusters without any go, those with one part left become that part.
 
     Args:
-        kids: Parts of the clusters of the whole tree, -1 for single panels, shape (2 n - 1, 2).
+        children: Parts of the clusters of the whole tree, -1 for single panels, shape (2 n - 1, 2).
         panel: Panel of a cluster without parts, shape (2 n - 1,).
         wanted: Which panels stay, at least one, shape (n,).
         new_kids, new_panel, function: Filled with the tree of m panels, as in ``Tree``; room for n.
@@ -333,35 +333,35 @@ def prune(kids, panel, wanted, new_kids, new_panel, function, room):
     """
     stands, queue = room[0], room[1]  # the cluster that a cluster has become, -1 for none
     count = 0
-    for k in range(kids.shape[0] - 1, -1, -1):
-        if kids[k, 0] < 0:
+    for k in range(children.shape[0] - 1, -1, -1):
+        if children[k, 0] < 0:
             stands[k] = k if wanted[panel[k]] else -1
             count += 1 if wanted[panel[k]] else 0
         else:
-            a, b = stands[kids[k, 0]], stands[kids[k, 1]]
+            a, b = stands[children[k, 0]], stands[children[k, 1]]
             stands[k] = k if a >= 0 and b >= 0 else max(a, b)
     queue[0] = stands[0]
     made, functions = 1, 0
     for k in range(2 * count - 1):
         old = queue[k]
-        if kids[old, 0] < 0:
+        if children[old, 0] < 0:
             new_kids[k, 0] = new_kids[k, 1] = -1
             new_panel[k], function[k] = panel[old], -1
         else:
             functions += 1
             new_panel[k], function[k] = -1, functions
             for c in range(2):
-                queue[made] = stands[kids[old, c]]
+                queue[made] = stands[children[old, c]]
                 new_kids[k, c] = made
                 made += 1
     return count
 
 
 @compiled
-def in_order(kids, panel):
+def in_order(children, panel):
     """The panels of a binary tree of clusters, those of a cluster side by side, shape (n,)."""
-    out, found = np.empty((kids.shape[0] + 1) // 2, np.int64), 0
-    stack, top = np.empty(kids.shape[0], np.int64), 1
+    out, found = np.empty((children.shape[0] + 1) // 2, np.int64), 0
+    stack, top = np.empty(children.shape[0], np.int64), 1
     stack[0] = 0
     while top > 0:
         top -= 1
@@ -370,6 +370,6 @@ def in_order(kids, panel):
             out[found] = panel[k]
             found += 1
             continue
-        stack[top], stack[top + 1] = kids[k, 1], kids[k, 0]
+        stack[top], stack[top + 1] = children[k, 1], children[k, 0]
         top += 2
     return out
