@@ -110,8 +110,8 @@ def make_system(
 def p1_system(mesh: TetMesh) -> System:
     """The P1 system of a mesh."""
     values, free = MeshSensor(mesh, design().electrode_names).unit_potentials()
-    screening = StiffnessMap(mesh)
-    matrix = screening.matrix(screening.assemble(np.ones(mesh.n_tets)))
+    stiffness = StiffnessMap(mesh)
+    matrix = stiffness.matrix(stiffness.assemble(np.ones(mesh.n_tets)))
     return make_system(matrix, values, np.flatnonzero(free), mesh.points, mesh.n_tets, 1)
 
 

@@ -8,7 +8,7 @@ import surface_twin
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.field.green_kernels import WALL_FADE_LENGTH
+from capsense.field.face_kernels import WALL_FADE_LENGTH
 from capsense.field.grid_kernels import (
     ALONG,
     GROWTH,

@@ -22,7 +22,7 @@ from capsense.mesh import TetMesh
 Array = NDArray[np.float64]
 
 
-def screening(mesh: TetMesh, eps_r: ArrayLike = 1.0) -> sp.csr_matrix:
+def stiffness(mesh: TetMesh, eps_r: ArrayLike = 1.0) -> sp.csr_matrix:
     """K [F], shape (n, n), for one relative permittivity or one for each tetrahedron."""
     corners = mesh.points[mesh.tets]
     # λ_a falls from 1 to 0 along the normal of the face across from a, of area |n_a| / 2.
@@ -41,7 +41,7 @@ def screening(mesh: TetMesh, eps_r: ArrayLike = 1.0) -> sp.csr_matrix:
 def link_weights(mesh: TetMesh, eps_r: ArrayLike = 1.0) -> Array:
     """Weight of every link of the mesh [F], shape (m,)."""
     a, b = mesh.edges.T
-    return -np.asarray(screening(mesh, eps_r)[a, b]).ravel()
+    return -np.asarray(stiffness(mesh, eps_r)[a, b]).ravel()
 
 
 def capacitance_p1(
@@ -55,7 +55,7 @@ def capacitance_p1(
     K φ_j = 0 at the free nodes, with 1 V on electrode j, 0 V on the others and on ground. What is
     in no group has a free surface (∂φ/∂n = 0).
     """
-    matrix = screening(mesh, eps_r)
+    matrix = stiffness(mesh, eps_r)
     phi = np.zeros((mesh.n_points, len(electrodes)))
     free = np.ones(mesh.n_points, dtype=bool)
     for column, name in enumerate(electrodes):

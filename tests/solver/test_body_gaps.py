@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reference_scenes import DATA, FEMTO, body_of_json
 
 import capsense as cs
-from capsense.field.green_kernels import held_off
+from capsense.field.face_kernels import held_off
 from capsense.solver.gap.body_gap_kernels import SHARE, facing_of, local_capacitance
 from capsense.solver.system.step import solve
 

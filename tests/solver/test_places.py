@@ -11,16 +11,9 @@ from plain_leaves import plain_leaves
 from surface_scenes import Placed, green_of, pack, shape_of
 
 import capsense as cs
+from capsense.field.face_kernels import lift, outside_fraction
 from capsense.field.green import LEVELS
-from capsense.field.green_kernels import (
-    Green,
-    Space,
-    beyond,
-    distances,
-    level_share,
-    lift,
-    pack_green,
-)
+from capsense.field.green_kernels import Green, distances, level_share, pack_green
 from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.interaction.pair_kernels import bound_images, leaf_pairs, mean_inverse
 from capsense.solver.placement.placement_kernels import placed
@@ -28,14 +21,6 @@ from capsense.solver.selection.evaluation_kernels import place
 from capsense.solver.selection.selection_kernels import chosen
 
 Array = np.ndarray
-
-
-def space_of(green: Green) -> Space:
-    """What places of single points need."""
-    gap = green.gap
-    return Space(
-        green.box, green.active_bounds, green.extent, green.cover, gap.validity, gap.soft.limit
-    )  # fmt: skip
 
 
 BOX = np.array([[-0.05, -0.04, -0.001], [0.05, 0.04, 0.0]])
@@ -137,7 +122,13 @@ H0 = 1.3e-3
 
 
 def with_validity(green: Green) -> Green:
-    return green._replace(gap=green.gap._replace(validity=H0))
+    return green._replace(
+        gap=green.gap._replace(validity=H0), space=green.space._replace(validity=H0)
+    )
+
+
+def faceless(green: Green) -> Green:
+    return green._replace(space=green.space._replace(has_face=False))
 
 
 @pytest.mark.parametrize(
@@ -153,8 +144,15 @@ def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) 
     np.testing.assert_allclose(
         green.active_bounds, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]]
     )
-    assert green.cover == 0.0
-    assert beyond(around(np.array(center)), space_of(green)) == pytest.approx(expected, abs=1e-9)
+    assert green.space.has_face
+    assert outside_fraction(around(np.array(center)), green.space, np.empty(3)) == pytest.approx(
+        expected, abs=1e-9
+    )
+
+
+def outside(center: Array, green: Green) -> float:
+    """The outside fraction of four points with a centre."""
+    return outside_fraction(around(center), green.space, np.empty(3))
 
 
 def around(center: Array) -> Array:
@@ -169,7 +167,9 @@ def test_behind_the_face_near_a_side(axis: int, side: int) -> None:
     green = with_validity(green_of())
     center = np.array([0.0, 0.0, float(green.box[1, 2]) - 0.008])
     center[axis] = green.box[side, axis] + (4.2 * H0 / 4) * (1 - 2 * side)
-    assert beyond(around(center), space_of(green)) == pytest.approx(0.5, abs=1e-9)
+    assert outside_fraction(around(center), green.space, np.empty(3)) == pytest.approx(
+        0.5, abs=1e-9
+    )
 
 
 def test_distance_of_clusters_from_the_design() -> None:
@@ -180,32 +180,33 @@ def test_distance_of_clusters_from_the_design() -> None:
     np.testing.assert_allclose(distances(points, green), wanted, atol=1e-15)
 
 
-def test_curved_designs_lift_nothing() -> None:
-    """Invariant: only of flat designs the space behind is known."""
-    green = green_of()._replace(cover=np.inf)
+def test_designs_without_a_face_lift_nothing() -> None:
+    """Invariant: only behind a face the space is known."""
+    green = faceless(green_of())
     bodies = pack(Placed(cs.Sphere(0.03), (0.0, 0.0, 0.0299)))
     cut = chosen(bodies, green, 0.015, 2.5, facing_of(bodies[:0]))
     leaves = placed(bodies, cut, green)
     np.testing.assert_array_equal(leaves.points, leaves.true)
-    assert beyond(np.array([(0.0, 0.0, -0.009)] * 4), space_of(green)) == 0.0
+    assert outside_fraction(np.array([(0.0, 0.0, -0.009)] * 4), green.space, np.empty(3)) == 0.0
 
 
-@pytest.mark.parametrize("cover", [0.0, 3e-4, np.inf])
-def test_clusters_are_looked_at_where_they_are_lifted_to(cover: float) -> None:
-    """Analytic: a distance d below 2 m becomes m + d² / 4 m; of a curved design it stays d."""
-    shape, green = cs.Capsule(0.008, 0.06), green_of()._replace(cover=cover)
+@pytest.mark.parametrize("has_face", [True, False])
+def test_clusters_are_looked_at_where_they_are_lifted_to(has_face: bool) -> None:
+    """Analytic: a distance d below 2 m becomes m + d² / 4 m; without a face it stays d."""
+    shape, green = cs.Capsule(0.008, 0.06), green_of()
+    green = green if has_face else faceless(green)
     top = float(green.box[1, 2])
     bodies = pack(Placed(shape, (0.0, 0.0, top + 0.0081), (0.0, math.pi / 2, 0.0)))
     tree, raised, point = shape_of(shape).tree, 0, np.zeros((1, 3), np.float32)
     for k in range(bodies[0]["n_panel_clusters"]):
-        square, _, _, _ = place(bodies[0], space_of(green), k, point, 0)
+        square, _, _, _ = place(bodies[0], green.space, k, point, 0, np.empty(3))
         wanted = bodies["rotation"][0] @ tree.center[k] + bodies["position"][0]
         d, m = wanted[2] - top, green.gap.validity
-        if d < 2 * m and cover < 1.0:
+        if d < 2 * m and has_face:
             wanted[2], raised = top + m + d * d / (4 * m), raised + 1
         assert square == pytest.approx((wanted[2] - top) ** 2, rel=1e-4)
         np.testing.assert_allclose(point[0], wanted, rtol=0, atol=1e-8)
-    assert (raised > 0) == (cover < 1.0)
+    assert (raised > 0) == has_face
 
 
 def test_what_crosses_a_wall_is_split_there() -> None:

@@ -14,7 +14,8 @@ from capsense._jit import compiled, first_use, kernel
 from capsense._thread_pool import in_parts
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
-from capsense.field.green_kernels import WALL_FADE_LENGTH, Green
+from capsense.field.face_kernels import WALL_FADE_LENGTH
+from capsense.field.green_kernels import Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading, FleetTouch
 from capsense.solver.gap.gap_kernels import near_bodies
 from capsense.solver.gap.touch_kernels import Foundation, press

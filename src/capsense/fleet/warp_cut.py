@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.field.green_kernels import DEEP, STEEP, WALL_FADE_LENGTH
+from capsense.field.face_kernels import DEEP, STEEP, WALL_FADE_LENGTH
 from capsense.solver.interaction.pair_kernels import LIFTED, WALL_PENALTY
 from capsense.solver.selection.evaluation_kernels import LONG
 
@@ -84,7 +84,7 @@ class Response:
     phi_columns: wp.int32  # columns of charges: of terminals, then of nodes
     terminals: wp.int32
     floor: wp.float32
-    cover: wp.float32
+    has_face: wp.int32
     extent: wp.float32  # shortest side of the domain
     validity: wp.float32  # distance from which the Green's function is valid
     blend0: wp.float32
@@ -269,7 +269,7 @@ def choose(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree)
 
 @wp.func
 def held_off(distance: float, length: float):
-    """A distance that becomes ``length`` in contact, as ``green_kernels.held_off``."""
+    """A distance that becomes ``length`` in contact, as ``face_kernels.held_off``."""
     if distance >= 2.0 * length:
         return distance
     return length + distance * distance / (4.0 * length)
@@ -277,7 +277,7 @@ def held_off(distance: float, length: float):
 
 @wp.func
 def lift(p: wp.vec3, gap: float, green: Response):
-    """Keep a point off a flat design, as ``green_kernels.lift``."""
+    """Keep a point off a flat design, as ``face_kernels.lift``."""
     away = _off(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
     way = wp.length(away)
     if way >= 2.0 * gap:
@@ -358,7 +358,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     off = wp.length(_off(c, green.room0, green.room1))
     lifted = int(0)
     deep = float(0.0)
-    if green.cover < 1.0:
+    if green.has_face != 0:
         depth = wp.min(1.0, green.box1[2] - c[2])
         for d in range(2):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))

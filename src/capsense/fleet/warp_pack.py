@@ -43,7 +43,7 @@ def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     out.length = solver.length
     out.extent, out.validity = green.extent, green.gap.validity
     out.floor = green.floor
-    out.cover = 1e3 if green.gap.curvature else min(green.cover, 1e3)  # bent films have no face
+    out.has_face = int(green.space.has_face and green.gap.curvature == 0.0)
     out.blend0, out.blend1 = green.blends[-1].tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (
         (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.active_bounds)

@@ -230,7 +230,7 @@ def bound_images(
 ):  # fmt: skip
     """Let no cluster meet its images more than in a mirror, as ``pair_kernels.bound_images``."""
     i, v = wp.tid()
-    if cut.node[i, v] < 0 or green.cover > 1.0:
+    if cut.node[i, v] < 0 or green.has_face == 0:
         return
     leaf = leaf_of(cut, i, v)
     face = green.box1[2]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
-from capsense.field.green_kernels import held_off, smooth
+from capsense.field.face_kernels import held_off, smooth
 from capsense.solver.bodies.outline import (
     BOX,
     CAPSULE,

@@ -20,7 +20,7 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles
-from capsense.field.green_kernels import held_off, lift, off_face, on_face, smooth
+from capsense.field.face_kernels import held_off, lift, off_face, on_face, smooth
 from capsense.field.soft import BODY
 from capsense.solver.bodies.outline import (
     CHANGING,

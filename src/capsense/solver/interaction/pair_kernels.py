@@ -22,7 +22,7 @@ from capsense._simd import (
     wide_span,
     wide_splat,
 )
-from capsense.field.green_kernels import on_face, smooth
+from capsense.field.face_kernels import on_face, smooth
 from capsense.solver.tree.mean_kernels import (
     add_line,
     add_means,
@@ -141,7 +141,7 @@ def bound_images(leaves, rows, pairs, green):
         pairs: As of :func:`leaf_pairs`; the diagonal is raised.
         green: Green's function of the design.
     """
-    if green.cover > 1.0:
+    if not green.space.has_face:
         return
     points, image, face = leaves.points, np.empty((4, 3)), green.gap.face[1, 2]
     for j in range(points.shape[0]):

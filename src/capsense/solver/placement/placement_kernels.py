@@ -30,13 +30,8 @@ from capsense._simd import (
     wide_span,
     wide_splat,
 )
-from capsense.field.green_kernels import (
-    beyond,
-    distances,
-    keep_off,
-    level_share,
-    source_potentials,
-)
+from capsense.field.face_kernels import keep_off, outside_fraction
+from capsense.field.green_kernels import distances, level_share, source_potentials
 from capsense.solver.tree.mean_kernels import extent_of, quadrature4
 
 
@@ -52,7 +47,7 @@ class ActiveClusters(NamedTuple):
     softening_length: NDArray[Any]
     """Distances below which 1/r from their points is bounded [m], shape (l,)."""
     outside_fraction: NDArray[Any]
-    """How far each is out of reach, 0 to 1, see ``green_kernels.beyond``, shape (l,)."""
+    """How far each is out of reach, 0 to 1, see ``face_kernels.outside_fraction``, shape (l,)."""
     owner: NDArray[Any]
     """Body of each, ascending, shape (l,)."""
     self_interaction_weight: NDArray[Any]
@@ -112,8 +107,8 @@ def _fill_leaves(bodies, cut, green, leaves, room):
         for q in range(4):
             for i in range(3):
                 corners[q, i] = points[q, i]  # before it is lifted
-        leaves.outside_fraction[j] = beyond(points, space, middle)
-        if space.cover < 1.0:
+        leaves.outside_fraction[j] = outside_fraction(points, space, middle)
+        if space.has_face:
             keep_off(points, space)
 
 

@@ -11,13 +11,8 @@ from numpy.typing import NDArray
 from capsense._dense import padded
 from capsense._jit import compiled, kernel
 from capsense._simd import WIDE, doubles, integers
-from capsense.field.green_kernels import (
-    WALL_FADE_LENGTH,
-    keep_off,
-    on_face,
-    point_potentials,
-    smooth,
-)
+from capsense.field.face_kernels import WALL_FADE_LENGTH, keep_off, on_face, smooth
+from capsense.field.green_kernels import point_potentials
 from capsense.field.grid_kernels import grid_values, to_grid
 
 _LINEAR = 0.45, 0.58
@@ -138,20 +133,20 @@ def place(body, space, k, points, found, middle):
         room = min(room, x - space.active_bounds[0, i], space.active_bounds[1, i] - x)
         out += max(space.active_bounds[0, i] - x, x - space.active_bounds[1, i], 0.0) ** 2
     square, height = face_distance(middle, space)
-    if square < 4.0 * space.validity * space.validity and space.cover < 1.0:
+    if square < 4.0 * space.validity * space.validity and space.has_face:
         keep_off(points[found : found + 1], space)
         square, height = face_distance(points[found], space)
     return square, height, room, math.sqrt(out) if out > 0.0 else 0.0
 
 
 @kernel
-def screening(cover, size, square, height):
+def screening(has_face, size, square, height):
     """:attr:`ClusterEvaluation.screening_factor` of a cluster of some size [m], from what
     :func:`place` returns.
 
-    ``cover`` is :attr:`Space.cover`.
+    ``has_face`` is :attr:`Space.has_face`.
     """
-    if cover > 1.0:  # the box of such designs is no surface
+    if not has_face:  # the box of such designs is no surface
         return 1.0
     far = _SCREENED * math.sqrt(square)
     if far >= _FREED * size:
@@ -228,7 +223,7 @@ def _look_into(body, green, coarser, looks, start, wanted):
             found += 1
         looks.children[row] = -1
         if whole or looks.linearity[row] < 1.0:
-            looks.screening_factor[row] = screening(green.cover, size, square, height)
+            looks.screening_factor[row] = screening(space.has_face, size, square, height)
         if looks.linearity[row] < 1.0 and not whole:
             looks.children[row] = stop
             for c in range(2):
@@ -280,7 +275,7 @@ def _close(points, share, green, near, close, rest):
     for j in range(points.shape[0]):
         part = 0.0
         square, _ = face_distance(points[j], space)
-        if green.cover < 1.0 and square < _CLOSE[1] * _CLOSE[1]:
+        if space.has_face and square < _CLOSE[1] * _CLOSE[1]:
             part = share[j] * smooth((_CLOSE[1] - math.sqrt(square)) / (_CLOSE[1] - _CLOSE[0]))
             near[count], close[count] = j, part
             count += 1

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
-from capsense.field.green_kernels import smooth
+from capsense.field.face_kernels import smooth
 from capsense.solver.gap.body_gap_kernels import crowded
 from capsense.solver.selection.score_kernels import DECAY, score
 

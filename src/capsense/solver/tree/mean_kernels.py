@@ -25,7 +25,7 @@ from capsense._simd import (
     wide_span,
     wide_splat,
 )
-from capsense.field.green_kernels import smooth
+from capsense.field.face_kernels import smooth
 from capsense.solver.bodies.panel_kernels import rectangle_potential
 from capsense.solver.tree.rigid import ROUND, SOFT
 
