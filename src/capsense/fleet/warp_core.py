@@ -101,10 +101,17 @@ class WarpCore:
             "capacitance": (slots, views),
             "part": (chunks, table.columns.shape[1] + slots, views),
         })  # fmt: skip
-        self.places = struct(warp_cut.Places, {
-            "choice neutral softness tie scale slack": (environments, places),
-            "hidden": (sensors, places), "group": (places,),
-        })  # fmt: skip
+        self.places = struct(
+            warp_cut.Places,
+            {
+                "choice neutral inverse_susceptibility ground_elastance scale slack": (
+                    environments,
+                    places,
+                ),
+                "hidden": (sensors, places),
+                "group": (places,),
+            },
+        )
         for name in ("scale", "inverse_susceptibility", "group"):
             setattr(self.near, name, getattr(self.places, name))
         for name in ("pose", "slot", "columns", "lossy"):

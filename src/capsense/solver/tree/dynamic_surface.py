@@ -259,18 +259,18 @@ class DynamicBody:
         self.sheet = sheet
         self.pieces = surface if isinstance(surface, PieceArrays) else None
         n = len(surface.areas)
-        self._kids, self._panel, self._function = tree.children, tree.panel, tree.function
+        self._children, self._panel, self._function = tree.children, tree.panel, tree.function
         if wanted is not None and not wanted.all():
-            self._kids, self._panel, self._function = (
+            self._children, self._panel, self._function = (
                 np.empty_like(a) for a in (tree.children, tree.panel, tree.function)
             )
             n = tree_kernels.prune(
-                tree.children, tree.panel, wanted, self._kids, self._panel, self._function,
+                tree.children, tree.panel, wanted, self._children, self._panel, self._function,
                 np.empty((2, len(tree.children)), np.int64),
             )  # fmt: skip
-            self._kids, self._panel, self._function = (
+            self._children, self._panel, self._function = (
                 np.ascontiguousarray(a[: 2 * n - 1])
-                for a in (self._kids, self._panel, self._function)
+                for a in (self._children, self._panel, self._function)
             )
         nodes = 2 * n - 1
         single = self._panel >= 0
@@ -282,7 +282,7 @@ class DynamicBody:
         )
         self._charge[single] = (surface.areas if charge is None else charge)[at]
         self._center[single], self._spread[single] = surface.centers[at], surface.moments[at]
-        tree_kernels.moments(self._kids, self._panel, self._charge, self._center, self._spread)
+        tree_kernels.moments(self._children, self._panel, self._charge, self._center, self._spread)
         extent = np.sqrt(6.0 * np.trace(self._spread, axis1=1, axis2=2)) + 1e-9
         self._extent = extent
         self.capacitance = 0.35 * float(extent[0])
@@ -305,7 +305,7 @@ class DynamicBody:
     @cached_property
     def order(self) -> Ints:
         """The pieces that count, those of a cluster one after another, shape (n,)."""
-        return tree_kernels.in_order(self._kids, self._panel)
+        return tree_kernels.in_order(self._children, self._panel)
 
     @property
     def radius(self) -> float:

@@ -261,7 +261,7 @@ class FinePanelBody(DynamicBody):
         cluster[tree.panel[tree.panel >= 0]] = number[above]
         self.weights = _equilibrium(panels, cluster)
         super().__init__(tree, panels, charge=self.weights)
-        self._points, self._soft = points_of_each(self._center, self._spread)
+        self._points, self._softening_length = points_of_each(self._center, self._spread)
         for name in (
             "points",
             "softening_length",
@@ -289,7 +289,7 @@ class FinePanelBody(DynamicBody):
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
             free = free_block(panels)
             more = impedance(panels, free) - HALF_SPACE * free
-        children, number, above = _coarsest(self._kids, self._panel, len(panels))
+        children, number, above = _coarsest(self._children, self._panel, len(panels))
         single = np.flatnonzero(self._panel >= 0)
         on = cKDTree(features(panels.centers, panels.normals, self.most)).query(self._at)[1]
         share = self._charge[single] / self._charge[above]

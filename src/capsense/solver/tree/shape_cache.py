@@ -324,11 +324,11 @@ def _packed(shape: RigidShape, key: str) -> tuple[dict[str, NDArray[Any]], dict[
     arrays: dict[str, NDArray[Any]] = {
         "corners": panels.corners[:, :3],
         "parts": panels.parts.astype(np.int32),
-        "children": tree.children.astype(np.int32),
+        "kids": tree.children.astype(np.int32),
         "function": tree.function.astype(np.int32),
         "panel": tree.panel.astype(np.int32),
         "charge": _charges(shape),
-        "potential_coefficients": shape.potential_coefficients[np.tril_indices(len(panels))],
+        "energy": shape.potential_coefficients[np.tril_indices(len(panels))],
     }
     return arrays, {
         "kind": "shape",
@@ -349,8 +349,8 @@ def _from_lower(values: Array32, n: int) -> Array32:
 def _unpacked(arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> RigidShape:
     corners = arrays["corners"][:, [0, 1, 2, 2]]
     panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
-    clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("children", "function", "panel")))
-    energy = _from_lower(arrays["potential_coefficients"], len(panels))
+    clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))
+    energy = _from_lower(arrays["energy"], len(panels))
     return RigidShape(
         panels, charged_tree(panels, clusters, arrays["charge"]), energy,
         float(meta["capacitance"]),
