@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled, first_use, kernel
+from capsense._jit import compiled, kernel
 from capsense._thread_pool import in_parts
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
@@ -292,9 +292,8 @@ class CpuCore:
             np.zeros(own), np.zeros(own), np.zeros((e, s)),
         )  # fmt: skip
         sensor = Sensor(green, solver.preset.threshold, solver.preset.width, cover)
-        with first_use():
-            in_parts(_step_rows, e, self._table.bodies, where, sensor, found)
-            loss = self._lossy(where, found)
+        in_parts(_step_rows, e, self._table.bodies, where, sensor, found)
+        loss = self._lossy(where, found)
         failed = np.flatnonzero(~np.isfinite(found.delta).all(axis=(1, 2, 3)))
         if len(failed):
             raise SolveError(

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import CapacitanceChange, Charges
@@ -244,10 +243,9 @@ class SurfaceSolver:
             records = np.empty(first[-1], BODY)  # numpy takes 10 µs for each to concatenate them
             for (_, _, bodies), start, end in zip(plain, first, first[1:], strict=False):
                 records[start:end] = bodies.records
-            with first_use():
-                delta, doubt, size = solve_each(
-                    records, first, self.green, self.preset.threshold, self.preset.width
-                )
+            delta, doubt, size = solve_each(
+                records, first, self.green, self.preset.threshold, self.preset.width
+            )
             delta, doubt = self.unit * delta, self.unit * doubt
             sound = np.isfinite(delta).all(axis=(1, 2))
             for i, (k, view, bodies) in enumerate(plain):
@@ -323,18 +321,17 @@ class SurfaceSolver:
         Raises:
             SolveError: Bodies lie within each other in a way that leaves no solution.
         """
-        with first_use():
-            bodies, preset = self.pack(view, time), self.preset
-            if not len(bodies.records):
-                return bodies, None
-            matter = bodies.matter
-            if matter.lossy:
-                out = solve_lossy(
-                    bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)),
-                    matter.inverse_susceptibility, self.green, preset.threshold, preset.width,
-                )  # fmt: skip
-            else:
-                out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
+        bodies, preset = self.pack(view, time), self.preset
+        if not len(bodies.records):
+            return bodies, None
+        matter = bodies.matter
+        if matter.lossy:
+            out = solve_lossy(
+                bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)),
+                matter.inverse_susceptibility, self.green, preset.threshold, preset.width,
+            )  # fmt: skip
+        else:
+            out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
         if not np.isfinite(out.delta).all():
             raise SolveError(_NO_SOLUTION)
         return bodies, out

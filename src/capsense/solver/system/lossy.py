@@ -84,7 +84,7 @@ def _lossy_lifted(
     factor = inverse_susceptibility[functions.body]
     matrix = np.concatenate([real, below]).astype(complex)
     matrix += factor[:, None] * np.concatenate([inside.matrix - real, inside.rest - below])
-    diagonal = own + factor * (inside.own - own)
+    diagonal = own + factor * (inside.diagonal - own)
     net = functions.cluster < 0
     for b in range(len(records)):
         root = np.flatnonzero((functions.body == b) & net)
