@@ -43,7 +43,7 @@ class Piece:
     turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rotation vector [rad]."""
     scale: float = 1.0
-    tie: complex = 0.0
+    ground_elastance: complex = 0.0
     """Energy of its net charge beyond that of its field [1/m]; infinite if it can have none."""
     eps_r: complex = np.inf
     group: int | None = None
@@ -72,7 +72,7 @@ class Clusters(NamedTuple):
 
     points: Array
     """Shape (k, 4, 3)."""
-    soft: Array
+    softening_length: Array
     owner: Array
 
 
