@@ -35,7 +35,7 @@ class Constant(NamedTuple):
     """A constant of the source."""
 
     module: str
-    """Its module, such as ``surface.step``."""
+    """Its module, such as ``solver.system.step``."""
     name: str
     value: str
     """As the source has it."""

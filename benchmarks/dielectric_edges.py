@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 import capsense as cs
-from capsense.surface.solver import Preset, SurfaceSolver
+from capsense.solver.surface_solver import Preset, SurfaceSolver
 
 Size = tuple[float, float, float]
 EDGES: tuple[Size, ...] = ((0.3, 0.26, 0.12), (0.3, 0.6, 0.1), (0.3, 0.3, 0.6))

@@ -128,7 +128,7 @@ def arrays_of(struct: Any, kind: Any, shared: set[str] | None = None) -> list[An
 
 def memory(options: dict[str, Any], crowd: bool) -> tuple[int, int]:
     """Bytes that a sensor takes on Warp, without gradients and with them."""
-    from capsense.fleet.warp_cut import WarpCut
+    from capsense.fleet.warp_cut import WarpActiveTree
     from capsense.fleet.warp_near import NearBodies
     from capsense.fleet.warp_slope import Slopes
     from capsense.fleet.warp_solve import Left
@@ -142,7 +142,7 @@ def memory(options: dict[str, Any], crowd: bool) -> tuple[int, int]:
         parts = [
             list(vars(core).values()),
             [
-                *arrays_of(core.cut, WarpCut), *arrays_of(core.left, Left),
+                *arrays_of(core.cut, WarpActiveTree), *arrays_of(core.left, Left),
                 *arrays_of(core.near, NearBodies, SHARED),
             ],
             [*core._slopes[:-1], *arrays_of(core._slopes[-1], Slopes, SHARED)],

@@ -34,10 +34,10 @@ from one_skin import person as one_skin
 from reference_scenes import MORE, diagonal_errors, reference_scenes
 
 import capsense as cs
-from capsense.elements.pieces import ChangingBody
-from capsense.elements.store import in_pieces
 from capsense.simulator import PresetName
-from capsense.surface.solver import Preset, SurfaceSolver
+from capsense.solver.surface_solver import Preset, SurfaceSolver
+from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.shape_cache import in_pieces
 
 DESIGN = "six_patch_bare"
 AT = (0.003, 0.026)
@@ -63,7 +63,7 @@ class InPieces(SurfaceSolver):
 
     def functions_of(
         self, shape: cs.Shape, conducting: bool, share: float = 1.0
-    ) -> tuple[ChangingBody, float]:
+    ) -> tuple[DynamicBody, float]:
         return in_pieces(shape, 80_000, conducting)
 
 

@@ -47,12 +47,12 @@ NOT_RUN = "@", "if TYPE_CHECKING:"
 """Lines that begin so are for Python itself and for type checkers."""
 CAUGHT = "killed", "timed out"
 
-Change = tuple[str, int]
+CapacitanceChange = tuple[str, int]
 """An operator, and which of its places."""
 Record = dict[str, Any]
 
 
-def changes_of(source: str) -> list[Change]:
+def changes_of(source: str) -> list[CapacitanceChange]:
     """All changes of a module."""
     nodes, lines = list(ast_nodes(get_ast(source))), source.splitlines()
     out = []
@@ -144,7 +144,7 @@ def copied(folder: Path) -> Path:
     return folder / "tree"
 
 
-def sampled(source: str, module: str, seed: int) -> Iterator[tuple[Change, str]]:
+def sampled(source: str, module: str, seed: int) -> Iterator[tuple[CapacitanceChange, str]]:
     """Changes in a random order, with the source that each makes."""
     changes = changes_of(source)
     random.Random(f"{seed} {module}").shuffle(changes)

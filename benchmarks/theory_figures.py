@@ -21,8 +21,8 @@ from matplotlib.patches import Rectangle
 
 import capsense as cs
 from capsense._style import COLOURS, FAINT, INK, LABELS, TITLES, bare
-from capsense.surface.between_kernels import facing_of
-from capsense.surface.step import prepared
+from capsense.solver.gap.body_gap_kernels import facing_of
+from capsense.solver.system.step import prepared
 
 FOLDER = Path(__file__).parents[1] / "docs" / "images"
 DESIGN, BARE = "six_patch", "six_patch_bare"

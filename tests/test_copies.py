@@ -17,7 +17,7 @@ from tiny_field import SETTINGS, tiny_design
 import capsense as cs
 from capsense import errors
 from capsense.mesh import kuhn_tets
-from capsense.surface.solver import SurfaceSolver, View
+from capsense.solver.surface_solver import SurfaceSolver, View
 
 DUPLICATES = [copy.copy, copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))]
 ERRORS = [

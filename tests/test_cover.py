@@ -7,7 +7,7 @@ import capsense as cs
 from capsense.cover import Cover, StressStrain
 from capsense.design import parse_design
 from capsense.errors import DesignError, SceneError
-from capsense.surface.touch_kernels import Foundation, contact_force, depth_of_force, foundation
+from capsense.solver.gap.touch_kernels import Foundation, contact_force, depth_of_force, foundation
 
 T, E = 2e-3, 60e3
 BOX = {"size": [0.1, 0.1, 0.1], "backplane": 0.01}

@@ -19,7 +19,7 @@ from numba.core.errors import TypingError
 
 import capsense
 from capsense import _jit
-from capsense.field.green_kernels import smooth
+from capsense.field.face_kernels import smooth
 
 
 class Pair(NamedTuple):

@@ -7,6 +7,9 @@ import os
 import re
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -59,24 +62,60 @@ def test_a_container_without_a_writable_place(option: list[str]) -> None:
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_what_is_said_of_a_first_use(kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only where kernels can be kept is it once."""
-    told: list[str] = []
-
-    class Timer:
-        def __init__(self, _: float, __: object, texts: list[str]) -> None:
-            told.extend(texts)
-
-        def start(self) -> None: ...
-        def cancel(self) -> None: ...
-
-    monkeypatch.setattr(_jit.threading, "Timer", Timer)
-    monkeypatch.setattr(_jit, "_done", False)
+def test_what_is_announced(
+    kept: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Compiling that takes long, once in a process; only where kernels can be kept it is once."""
+    monkeypatch.setattr(_jit, "_said", False)
+    monkeypatch.setattr(_jit, "WAIT", 0.0)
     monkeypatch.setattr(_kernel_cache, "kept", kept)
-    with _jit.first_use():
-        pass
-    assert ("once, and is then kept" in told[0]) == kept
-    assert ("in each process" in told[0]) != kept
+    for _ in range(2):
+        with _jit._announced(), _jit._announced():
+            time.sleep(0.1)
+    assert len(caplog.messages) == 1
+    assert ("once on this machine" in caplog.messages[0]) == kept
+    assert ("in each process" in caplog.messages[0]) != kept
+
+
+def test_nothing_is_announced_of_kernels_that_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only what has to be compiled is."""
+    announced: list[int] = []
+
+    @contextmanager
+    def count() -> Iterator[None]:
+        announced.append(1)
+        yield
+
+    monkeypatch.setattr(_jit, "_announced", count)
+    (tmp_path / "kept_kernels.py").write_text(KERNELS)
+    counts = []
+    for _ in range(2):
+        spec = importlib.util.spec_from_file_location("kept_kernels", tmp_path / "kept_kernels.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        module.outer(3.0)
+        counts.append(len(announced))
+    assert counts == [2, 2]
+
+
+def test_plain_numba_gives_the_same_bits(tmp_path: Path) -> None:
+    """``CAPSENSE_PLAIN_NUMBA=1``: the public interface alone compiles and keeps kernels."""
+    (tmp_path / "kept_kernels.py").write_text(KERNELS)
+    found = []
+    for plain in ("0", "1"):
+        folder = tmp_path / plain
+        env = {**os.environ, "PYTHONPATH": _path(), "NUMBA_CACHE_DIR": str(folder)}
+        env["CAPSENSE_PLAIN_NUMBA"] = plain
+        run = [sys.executable, "-c", CODE, str(tmp_path)]
+        done = subprocess.run(run, env=env, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        found.append(done.stdout)
+        assert len(list(folder.rglob("*.nbc"))) == 2
+    assert found[0] == found[1]
 
 
 CODE = """

@@ -19,7 +19,7 @@ from capsense.adapters import skin as skin_module
 from capsense.fleet.bodies import BodyTable
 from capsense.masked import MaskedScenes
 from capsense.readout.conversions import SideBySide
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.surface_solver import SurfaceSolver
 
 
 @pytest.fixture(params=["surface", "fem_masked"])

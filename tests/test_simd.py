@@ -32,7 +32,7 @@ from capsense._simd import (
     wide_span,
     wide_splat,
 )
-from capsense.elements.panel_kernels import angle_of
+from capsense.solver.bodies.panel_kernels import angle_of
 
 ROOTS = """
 import numpy as np

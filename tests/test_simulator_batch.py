@@ -14,8 +14,8 @@ import capsense as cs
 from capsense.errors import BatchError, SceneError, SolveError
 from capsense.field.background import Change
 from capsense.masked import MaskedScenes
-from capsense.surface import solver
-from capsense.surface.solver import SurfaceSolver, View
+from capsense.solver import surface_solver as solver
+from capsense.solver.surface_solver import SurfaceSolver, View
 
 
 @pytest.fixture

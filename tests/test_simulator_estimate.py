@@ -9,7 +9,7 @@ import pytest
 
 import capsense as cs
 from capsense.design.model import Domain
-from capsense.surface.solver import PRESETS, Preset, SurfaceSolver
+from capsense.solver.surface_solver import PRESETS, Preset, SurfaceSolver
 
 Pair = tuple[cs.Simulator, cs.Simulator]
 

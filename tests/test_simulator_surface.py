@@ -21,7 +21,7 @@ from random_scenes import random_scene
 from reference_scenes import MAP, MORE, diagonal_errors, other_errors, reference_scenes
 
 import capsense as cs
-from capsense.surface.solver import PRESETS, Preset, SurfaceSolver
+from capsense.solver.surface_solver import PRESETS, Preset, SurfaceSolver
 
 Array = np.ndarray
 

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from capsense._thread_pool import OneAtATime, ThreadPool, processors, some_failed
+from capsense._thread_pool import ForkSafeRLock, ThreadPool, processors, some_failed
 from capsense.errors import SceneError
 
 
@@ -92,7 +92,7 @@ def test_processors_where_a_system_does_not_tell(monkeypatch: pytest.MonkeyPatch
 
 def test_a_lock_that_is_held_while_the_process_forks() -> None:
     """Regression: the thread that holds it is not in the child, which would wait for ever."""
-    one, held, done = OneAtATime(), threading.Event(), threading.Event()
+    one, held, done = ForkSafeRLock(), threading.Event(), threading.Event()
 
     def hold() -> None:
         with one:

@@ -26,12 +26,14 @@ from capsense.cli import (
     say,
     serve,
     studies,
+    warmup,
 )
 from capsense.errors import CapSenseError, FieldError, SolveError
 
 COMMANDS = (
     run.run, run.record, recordings.replay, recordings.export, design.design, recordings.readout,
     studies.dataset, studies.optimise, studies.bench, studies.reproduce, serve.serve, serve.view,
+    warmup.warmup,
 )  # fmt: skip
 """The subcommands, in the order of ``--help``. A new one is a function that
 :func:`~capsense.cli.command` decorates, listed here."""

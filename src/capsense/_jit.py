@@ -1,4 +1,4 @@
-"""How the kernels of the online solver are compiled, and a word to whoever waits for that.
+"""How the kernels of the online solver are compiled, and a notice while that takes long.
 
 None may reorder sums (``fastmath``): Numba puts a kernel that others call into each of them, and
 which of its versions runs depends on what was loaded first. With sums reordered they differ in the
@@ -11,13 +11,15 @@ from __future__ import annotations
 import gc
 import hashlib
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numba
 from filelock import FileLock
 from numba import config, types, version_info
 from numba.core.caching import FunctionCache
@@ -30,12 +32,14 @@ from capsense import _kernel_cache
 _log = logging.getLogger("capsense")
 
 WAIT = 2.0
-"""A first use that takes longer than this [s] is explained."""
-_done = False
+"""Compiling that takes longer than this [s] is announced."""
+_PLAIN = os.environ.get("CAPSENSE_PLAIN_NUMBA", "0") not in ("", "0")
+"""``CAPSENSE_PLAIN_NUMBA=1``: ``numba.njit(cache=True)`` alone compiles kernels. It uses public
+interfaces of Numba only, takes longer, and notices changed sources of a kernel's own file only."""
 
 
-_PARTS_WITH_KERNELS = "design", "scene", "elements", "field", "surface", "fleet", "adapters"
-SOURCES = "*.py", *(f"{part}/*.py" for part in _PARTS_WITH_KERNELS)
+_PARTS_WITH_KERNELS = "design", "scene", "field", "solver", "fleet", "adapters"
+SOURCES = "*.py", *(f"{part}/**/*.py" for part in _PARTS_WITH_KERNELS)
 """Modules of the package that kernels, and the constants in them, are in."""
 
 
@@ -76,6 +80,11 @@ class _Cache(FunctionCache):
         if self._index_key(sig, context.codegen()) in self._cache_file._load_index():
             yield
             return
+        with _announced(), self._locked():
+            yield
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
         path = Path(self.cache_path, f"{self._impl.filename_base}.lock")
         lock = FileLock(path)
         try:
@@ -90,6 +99,40 @@ class _Cache(FunctionCache):
                 with suppress(OSError):
                     path.unlink()  # before others can have it; those who wait see that it is gone
                 lock.release()
+
+
+_depth, _said = 0, False
+"""How many kernels are being compiled, one for another; whether it was announced."""
+
+
+@contextmanager
+def _announced() -> Iterator[None]:
+    """Log once in a process that kernels are compiled, where that takes longer than ``WAIT``.
+
+    It is a warning of the logger ``capsense``, which goes to standard error unless told otherwise.
+    """
+    global _depth
+    timer = threading.Timer(WAIT, _announce) if _depth == 0 and not _said else None
+    if timer is not None:
+        timer.daemon = True
+        timer.start()
+    _depth += 1
+    try:
+        yield
+    finally:
+        _depth -= 1
+        if timer is not None:
+            timer.cancel()
+
+
+def _announce() -> None:
+    global _said
+    _said = True
+    often = "once on this machine" if _kernel_cache.kept else "in each process"
+    _log.warning(
+        "compiling kernels for this processor; it takes up to a minute %s; "
+        "capsense warmup does it ahead of time", often,
+    )  # fmt: skip
 
 
 class _PartCache(_Cache):
@@ -168,6 +211,8 @@ _OFF = bool(config.DISABLE_JIT)  # type: ignore[attr-defined]
 def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """A decorator for functions that Python calls, or other kernels, or both."""
     options |= {"nopython": True, "nogil": True, "error_model": "numpy"}
+    if _PLAIN:
+        return numba.njit(cache=True, **options)
     options["no_cfunc_wrapper"] = True  # nothing calls kernels by address
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -185,29 +230,3 @@ Numba counts references to every array that is passed on or sliced, by atomic op
 more than half of the time of a scan, and a fifth of a step. Room that a kernel needs is therefore
 handed to it. It returns no arrays, not even parts of those that it was given.
 """
-
-
-def first_use() -> AbstractContextManager[None]:
-    """Say, if the first use in a process takes long, that kernels are compiled.
-
-    It is a warning of the logger ``capsense``, which goes to standard error unless told otherwise.
-    """
-    return _NOTHING if _done else _told()
-
-
-_NOTHING = nullcontext()
-
-
-@contextmanager
-def _told() -> Iterator[None]:
-    global _done
-    often = "once, and is then kept" if _kernel_cache.kept else "in each process"
-    told = f"compiling the solver for this processor; it takes 15 to 25 seconds {often}"
-    timer = threading.Timer(WAIT, _log.warning, [told])
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-        _done = True
-    finally:
-        timer.cancel()

@@ -58,7 +58,7 @@ def filled(kernel: Callable[..., None], out: Array, *args: Any) -> Array:
     return out
 
 
-_LOCKS: weakref.WeakSet[OneAtATime] = weakref.WeakSet()
+_LOCKS: weakref.WeakSet[ForkSafeRLock] = weakref.WeakSet()
 
 
 def _renew() -> None:
@@ -70,7 +70,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew)
 
 
-class OneAtATime:
+class ForkSafeRLock:
     """A lock for what one thread may use at a time; a copy, or a pickled one, is a new lock.
 
     So is that of a forked process: a thread that held it has not come along.
@@ -86,8 +86,8 @@ class OneAtATime:
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def __reduce__(self) -> tuple[type[OneAtATime], tuple[()]]:
-        return OneAtATime, ()
+    def __reduce__(self) -> tuple[type[ForkSafeRLock], tuple[()]]:
+        return ForkSafeRLock, ()
 
 
 class ThreadPool:

@@ -15,13 +15,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._frozen import read_only
-from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
+from capsense._thread_pool import ForkSafeRLock, ThreadPool, some_failed
 from capsense._validate import checked_frequency, shorten
 from capsense.cover import Touch
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError, SceneError
-from capsense.field.background import BackgroundField, BuildSettings, Change, Charges, Terminals
+from capsense.field.background import (
+    BackgroundField,
+    BuildSettings,
+    CapacitanceChange,
+    Charges,
+    Terminals,
+)
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.reading import Reading, StepStats
@@ -57,9 +63,9 @@ class _Solver(Protocol):
 
     def solve(
         self, scene: Scene, *, jacobian: bool = False, time: float | None = None
-    ) -> Change: ...
+    ) -> CapacitanceChange: ...
 
-    def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]: ...
+    def solve_each(self, scenes: Sequence[Scene]) -> list[CapacitanceChange | CapSenseError]: ...
 
     def potentials(self, points: Array) -> Array: ...
 
@@ -151,7 +157,7 @@ class Simulator:
             )
         self._background = background
         self._solver, rest = self._make_solver()
-        self._one = OneAtATime()
+        self._one = ForkSafeRLock()
         self._contact_told = False
         self._idle: deque[_Solver] = deque()  # for the threads of batches
         self._names = self.design.electrode_names
@@ -183,7 +189,7 @@ class Simulator:
                 sensor, self.excitation_frequency, electrodes=self.design.electrode_names
             )
             return scenes, self.background.capacitance if self.mesh is None else scenes.empty
-        from capsense.surface.solver import PRESETS, SurfaceSolver
+        from capsense.solver.surface_solver import PRESETS, SurfaceSolver
 
         field = self.background
         return SurfaceSolver(
@@ -269,7 +275,7 @@ class Simulator:
                 return reading
             return replace(reading, counts=self.readout.sample(time, reading))
 
-    def _of(self, found: Change, scene: Scene, seconds: float) -> Reading:
+    def _of(self, found: CapacitanceChange, scene: Scene, seconds: float) -> Reading:
         """The reading that a solver's result makes, which took some time [s]."""
         terminals = self._terminals
         change: NDArray[Any] = terminals.screened(found.matrix)

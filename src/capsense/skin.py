@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
+from capsense._thread_pool import ForkSafeRLock, ThreadPool, some_failed
 from capsense._validate import shorten, suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError, SkinError
@@ -49,7 +49,7 @@ class Skin:
             if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], Pose)):
                 raise SceneError(f"sensor {name!r} is {pair!r}; give a pair (design, Pose(…))")
             designs[name], self.poses[name] = pair
-        self._pool, self._one = ThreadPool(threads), OneAtATime()
+        self._pool, self._one = ThreadPool(threads), ForkSafeRLock()
         self.simulators: dict[str, Simulator] = make_simulators(designs)
         """The sensors themselves."""
 

@@ -220,10 +220,14 @@ def test_a_step_allocates_nothing_and_waits_for_nothing(monkeypatch):
     assert counts == {"allocations": 0, "copies": 0}
     wp.zeros(1, device="cpu").numpy()
     assert min(counts.values()) > 0  # it counts
-    places = [getattr(fleet._warp.places, x).ptr for x in ("choice", "scale", "tie", "softness")]
+    places = [
+        getattr(fleet._warp.places, x).ptr
+        for x in ("choice", "scale", "ground_elastance", "inverse_susceptibility")
+    ]
     fleet.change(0, BODIES[1], [1])
     assert places == [
-        getattr(fleet._warp.places, x).ptr for x in ("choice", "scale", "tie", "softness")
+        getattr(fleet._warp.places, x).ptr
+        for x in ("choice", "scale", "ground_elastance", "inverse_susceptibility")
     ]
     run = 1
     fleet.step(where, frame, time=time, jacobian=True)
@@ -267,13 +271,13 @@ def test_captured_steps():
 def test_functions_that_add_nothing_are_left_out(lossy):
     """Analytic: of two functions that are the same, the second one changes nothing."""
     from capsense.fleet import warp_solve
-    from capsense.fleet.warp_cut import WarpCut
+    from capsense.fleet.warp_cut import WarpActiveTree
 
     whole = np.array([[1.0, 1.0, 0.5], [1.0, 1.0, 0.5], [0.5, 0.5, 2.0]]) + 0j
     whole += lossy * 1j * np.array([[0.4, 0.4, 0.1], [0.4, 0.4, 0.1], [0.1, 0.1, 0.3]])
     phi = np.array([0.7, 0.7, -0.2])
     packed = np.tril(whole.real) + np.triu(whole.imag, 1)
-    cut = WarpCut()
+    cut = WarpActiveTree()
     cut.number = wp.zeros((3, 1), dtype=wp.int32, device="cpu")
     cut.lossy = wp.array([int(lossy)], dtype=wp.int32, device="cpu")
     cut.columns = wp.ones(1, dtype=wp.int32, device="cpu")

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 import capsense as cs
 from capsense.field.green_kernels import Green
-from capsense.surface import lossy, step
-from capsense.surface.choose_kernels import Cut, Functions, functions_of
-from capsense.surface.gap_kernels import (
+from capsense.solver.gap.gap_kernels import (
     extent_of_body,
     fabric_change,
     local_change,
@@ -23,9 +21,14 @@ from capsense.surface.gap_kernels import (
     near_bodies,
     press_out,
 )
-from capsense.surface.gradient_kernels import jacobian
-from capsense.surface.leaf_kernels import leaf_rows, placed
-from capsense.surface.network_kernels import (
+from capsense.solver.gradients.gradient_kernels import jacobian
+from capsense.solver.interaction.pair_kernels import LIFTED, WALL_PENALTY, bound_images, leaf_pairs
+from capsense.solver.packing import PackedBodies, View
+from capsense.solver.placement.placement_kernels import leaf_rows, placed
+from capsense.solver.selection.selection_kernels import ActiveTree, Functions, functions_of
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.system import lossy, step
+from capsense.solver.system.network_kernels import (
     as_nodes,
     coarse_of,
     congruent,
@@ -33,10 +36,7 @@ from capsense.surface.network_kernels import (
     potentials_of,
     with_nodes,
 )
-from capsense.surface.packing import PackedBodies, View
-from capsense.surface.pair_kernels import BARRIER, LIFTED, bound_images, leaf_pairs
-from capsense.surface.solve_kernels import System, assembled, leaf_charges, reduced
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.system.system_kernels import System, assembled, leaf_charges, reduced
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def _smooth(x: Array) -> Array:
 
 def cut_of(
     green: Green, bodies: NDArray[np.void], trees: list, count: int, favoured: list[Array]
-) -> Cut:
+) -> ActiveTree:
     """Clusters by what is largest against its distance from the design, ``count`` for each body.
 
     What crosses a wall counts as larger, by twice its share of the body's length.
@@ -63,51 +63,55 @@ def cut_of(
         low, high = green.box
         away = np.linalg.norm(np.maximum(np.maximum(low - center, center - high), 0.0), axis=1)
         size = body["scale"] * tree.extent
-        need = np.where(tree.kids[:, 0] < 0, 0.0, size / (np.maximum(away, 0.5 * size) + 1e-3))
-        room = np.minimum((center - green.room[0]).min(1), (green.room[1] - center).min(1))
+        need = np.where(tree.children[:, 0] < 0, 0.0, size / (np.maximum(away, 0.5 * size) + 1e-3))
+        room = np.minimum(
+            (center - green.active_bounds[0]).min(1), (green.active_bounds[1] - center).min(1)
+        )
         crossing = _smooth(2.0 - 4.0 * np.abs(room) / (size + 1e-9))
         crossing *= _smooth((size - 0.03) / 0.03) * tree.extent / tree.extent[0]
-        need += np.where(tree.kids[:, 0] < 0, 0.0, 2.0 * crossing)
+        need += np.where(tree.children[:, 0] < 0, 0.0, 2.0 * crossing)
         if favoured:
             need *= 1.0 + 1e-5 * np.isin(tree.function, favoured[b])
         heap, split = [(-need[0], 0)], set()
         while len(heap) < count and heap[0][0] < 0.0:
             _, k = heapq.heappop(heap)
             split.add(k)
-            for part in tree.kids[k].tolist():
+            for part in tree.children[k].tolist():
                 heapq.heappush(heap, (-need[part], part))
         ends = {k for _, k in heap}
-        below = {part for k in ends for part in tree.kids[k].tolist() if part >= 0}
+        below = {part for k in ends for part in tree.children[k].tolist() if part >= 0}
         used = sorted(split | ends | below)
         place = {k: len(rows) + i for i, k in enumerate(used)}
         for k in used:
             whole, fade, above = float(k not in split), float(k in split), float(k not in below)
-            leaf, kids, share = -1, (-1, -1), 0.0
-            if k in split or (k in ends and tree.kids[k, 0] >= 0):
-                x, y = tree.kids[k].tolist()
-                kids, share = (place[x], place[y]), tree.charge[x] / tree.charge[k]
+            leaf, children, share = -1, (-1, -1), 0.0
+            if k in split or (k in ends and tree.children[k, 0] >= 0):
+                x, y = tree.children[k].tolist()
+                children, share = (place[x], place[y]), tree.charge[x] / tree.charge[k]
             if k not in split:
                 leaf = len(leaves)
                 leaves.append(place[k])
-            rows.append((b, k, *kids, share, leaf, whole, fade, above))
+            rows.append((b, k, *children, share, leaf, whole, fade, above))
     body, node, first, second, share, leaf, whole, fade, above = (
         np.array(c) for c in zip(*rows, strict=True)
     )
-    kids = np.stack([first, second], axis=1)
+    children = np.stack([first, second], axis=1)
     parts = (1.0 - whole)[:, None] * np.stack([share, 1.0 - share], axis=1)
     there = np.ones(len(node))
-    return Cut(body, node, kids, share, parts, leaf, whole, fade, above, there, np.array(leaves))
+    return ActiveTree(
+        body, node, children, share, parts, leaf, whole, fade, above, there, np.array(leaves)
+    )
 
 
-def _add_barrier(cut: Cut, functions: Functions, system: System, beyond: Array) -> None:
+def _add_barrier(cut: ActiveTree, functions: Functions, system: System, beyond: Array) -> None:
     """Add the energy of charge that is out of reach; with pairs, in single precision, it would hide
     1e-3 of a matrix."""
-    total, n = len(system.own), functions.solved
+    total, n = len(system.diagonal), functions.solved
     on = leaf_charges(cut, functions, np.eye(total), len(beyond)).T
-    energy = (on * BARRIER * beyond**3) @ on.T
+    energy = (on * WALL_PENALTY * beyond**3) @ on.T
     system.matrix[:] += energy[:n, :n]
     system.rest[:] += energy[n:, :n]
-    system.own[:] += np.diag(energy)
+    system.diagonal[:] += np.diag(energy)
 
 
 @contextmanager
@@ -130,20 +134,20 @@ def same_functions(count: int) -> Iterator[list[Array]]:
     def prepared(bodies: NDArray[np.void], green: Green, *_: float) -> tuple:
         cut = cut_of(green, bodies, [shape.tree for shape in shapes], count, favoured)
         leaves = placed(bodies, cut, green)
-        rows = leaf_rows(leaves.points, leaves.beyond, green)
-        functions = functions_of(bodies, cut, leaves.beyond)
-        inside = leaves._replace(beyond=np.zeros_like(leaves.beyond))
+        rows = leaf_rows(leaves.points, leaves.outside_fraction, green)
+        functions = functions_of(bodies, cut, leaves.outside_fraction)
+        inside = leaves._replace(beyond=np.zeros_like(leaves.outside_fraction))
         pairs = leaf_pairs(inside, green.floor)
         bound_images(leaves, rows, pairs, green)
-        system = assembled(bodies, cut, functions, rows, pairs, green.lead)
-        for f in range(functions.solved, len(system.own)):
+        system = assembled(bodies, cut, functions, rows, pairs, green.phi_columns)
+        for f in range(functions.solved, len(system.diagonal)):
             body, x = bodies[functions.body[f]], functions.number[f]
             shape = shapes[functions.body[f]]
-            own = shape.energy[x, x]
-            if body["impedance"] != 0:
-                own = own + body["softness"] * shape.impedance[x, x]
-            system.own[f] = own / body["scale"]
-        _add_barrier(cut, functions, system, leaves.beyond)
+            own = shape.potential_coefficients[x, x]
+            if body["neumann_to_dirichlet"] != 0:
+                own = own + body["inverse_susceptibility"] * shape.neumann_to_dirichlet[x, x]
+            system.diagonal[f] = own / body["scale"]
+        _add_barrier(cut, functions, system, leaves.outside_fraction)
         return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
@@ -164,12 +168,23 @@ def same_functions(count: int) -> Iterator[list[Array]]:
             weights = potentials_of(delta, m, nodes, capacitance)
             delta = congruent(weights, delta, capacitance)
             left = congruent(weights, left, np.zeros(0))
-            charge, coarse = mixed(charge, weights, green.lead), coarse_of(coarse, weights)
+            charge, coarse = mixed(charge, weights, green.phi_columns), coarse_of(coarse, weights)
         return step.Solution(
-            delta[:m, :m] + fabric, left[:m, :m], coarse[:m], charge,
-            leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
-            step.estimate(delta, left, coarse[:m], shift, green.electrodes), near, node, weights,
-        )  # fmt: skip
+            delta[:m, :m] + fabric,
+            left[:m, :m],
+            coarse[:m],
+            charge,
+            leaves.points,
+            leaves.extent,
+            leaves.softening_length,
+            leaves.owner,
+            functions.solved,
+            shift,
+            step.estimate(delta, left, coarse[:m], shift, green.electrodes),
+            near,
+            node,
+            weights,
+        )
 
     def slopes(
         solution: step.Solution, bodies: NDArray[np.void], green: Green, *others: float
@@ -192,8 +207,8 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 
     with (
         patch.object(SurfaceSolver, "pack", packed),
-        patch("capsense.surface.solver.slopes_of", slopes),
-        patch("capsense.surface.solver.solve", solve),
+        patch("capsense.solver.surface_solver.slopes_of", slopes),
+        patch("capsense.solver.surface_solver.solve", solve),
         patch.object(lossy, "prepared", prepared),
     ):
         yield favoured

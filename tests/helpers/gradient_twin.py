@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from capsense.elements.mean_kernels import FAR
 from capsense.field.green_kernels import Green
-from capsense.surface.step import Solution
+from capsense.solver.system.step import Solution
+from capsense.solver.tree.mean_kernels import FAR
 
 Array = np.ndarray
 STEP = 1e-5
@@ -47,14 +47,16 @@ def _energy(points: Array, solution: Solution, green: Green) -> Array:
     """``Φᵀq + qᵀΦ - qᵀAq`` but for what does not change as rigid bodies move, shape (m, m)."""
     charge = solution.charge[:, : green.terminals]
     rows = _rows(points, solution.points, green)
-    phi, psi = rows[:, : green.terminals], rows[:, green.lead :]
+    phi, psi = rows[:, : green.terminals], rows[:, green.phi_columns :]
     modes = psi.T @ charge
     image = points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * green.floor]
     still = solution.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * green.floor]
-    pairs = -_means(points, image, _far(solution.points, still, solution.extent), solution.soft)
+    pairs = -_means(
+        points, image, _far(solution.points, still, solution.extent), solution.softening_length
+    )
     other = solution.owner[:, None] != solution.owner
     far = _far(solution.points, solution.points, solution.extent)
-    pairs += np.where(other, _means(points, points, far, solution.soft), 0.0)
+    pairs += np.where(other, _means(points, points, far, solution.softening_length), 0.0)
     return phi.T @ charge + charge.T @ phi - charge.T @ pairs @ charge + modes.T @ modes
 
 

@@ -124,8 +124,8 @@ def start() -> None:
 
     for name, twin in TWINS.items():
         setattr(_simd, name, twin)
-    from capsense.elements import rigid
     from capsense.field import grid_kernels
+    from capsense.solver.tree import rigid
 
     grid_kernels.ALONG = 3  # every simulator fills a table
 

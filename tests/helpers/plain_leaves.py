@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from capsense.surface.leaf_kernels import Leaves
+from capsense.solver.placement.placement_kernels import ActiveClusters
 
 
-def plain_leaves(*fields: Any) -> Leaves:
+def plain_leaves(*fields: Any) -> ActiveClusters:
     """Leaves from their fields ``points`` to ``within``."""
     count = len(fields[0])
-    return Leaves(*fields, np.full((count, 2), -1), np.ones(count))
+    return ActiveClusters(*fields, np.full((count, 2), -1), np.ones(count))

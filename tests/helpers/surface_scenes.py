@@ -10,9 +10,9 @@ from interpreted import fewer, thinned
 from scipy.spatial.transform import Rotation
 
 import capsense as cs
-from capsense.elements.panels import panels_of
-from capsense.elements.rigid import BODY, RigidShape, rigid_shape
 from capsense.field.green_kernels import Green, pack_green
+from capsense.solver.bodies.panels import panels_of
+from capsense.solver.tree.rigid import BODY, RigidShape, rigid_shape
 
 Array = np.ndarray
 
@@ -51,9 +51,9 @@ def pack(*bodies: Placed) -> Array:
         out["rotation"][k] = Rotation.from_rotvec(body.turned).as_matrix()
         out["neutral"][k] = body.floating or np.isfinite(body.eps_r)
         if np.isfinite(body.eps_r):
-            out["impedance"][k] = shape.impedance.ctypes.data
-            out["softness"][k] = 1.0 / (body.eps_r - 1.0)
-            out["stiffer"][k] = 2.0 / (body.eps_r - 1.0)
+            out["neumann_to_dirichlet"][k] = shape.neumann_to_dirichlet.ctypes.data
+            out["inverse_susceptibility"][k] = 1.0 / (body.eps_r - 1.0)
+            out["polarization_stiffness"][k] = 2.0 / (body.eps_r - 1.0)
     return out
 
 

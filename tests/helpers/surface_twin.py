@@ -15,18 +15,18 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from capsense.elements.blocks import free_block, impedance
-from capsense.elements.panels import SurfacePanels
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.field.grid_kernels import Grid
+from capsense.solver.bodies.blocks import free_block, impedance
+from capsense.solver.bodies.panels import SurfacePanels
 
 Array = np.ndarray
 SOFT, ROUND = 0.15, 0.82
 """Points of different bodies see 1/r bounded: extent and least moment count so much for it."""
 GAIN = 1.3
 """What functions that are left out stand for, themselves and all below."""
-BARRIER = 1e5
+WALL_PENALTY = 1e5
 """Energy of charge out of reach [1/m]."""
 FULL = 0.1
 """How far something of a cluster within reach is represented where its functions are whole."""
@@ -43,7 +43,7 @@ class Piece:
     turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rotation vector [rad]."""
     scale: float = 1.0
-    tie: complex = 0.0
+    ground_elastance: complex = 0.0
     """Energy of its net charge beyond that of its field [1/m]; infinite if it can have none."""
     eps_r: complex = np.inf
     group: int | None = None
@@ -51,7 +51,7 @@ class Piece:
 
     @property
     def neutral(self) -> bool:
-        return bool(np.isinf(self.tie))
+        return bool(np.isinf(self.ground_elastance))
 
     @cached_property
     def block(self) -> Array:
@@ -72,7 +72,7 @@ class Clusters(NamedTuple):
 
     points: Array
     """Shape (k, 4, 3)."""
-    soft: Array
+    softening_length: Array
     owner: Array
 
 
@@ -81,12 +81,14 @@ def galerkin(pieces: tuple[Piece, ...], green: GreenFunction, room: Array) -> Ar
     found = clusters(pieces, [np.eye(len(p.panels)) for p in pieces])
     out = beyond(found.points, room)
     matrix = interaction(found, green, out)
-    matrix = matrix.astype(np.result_type(*(p.block for p in pieces), *(p.tie for p in pieces)))
+    matrix = matrix.astype(
+        np.result_type(*(p.block for p in pieces), *(p.ground_elastance for p in pieces))
+    )
     group = np.array([-1 - b if p.group is None else p.group for b, p in enumerate(pieces)])
     for b, piece in enumerate(pieces):
         own, joint = found.owner == b, group[found.owner] == group[b]
         matrix[np.ix_(own, own)] += piece.block
-        matrix[np.ix_(own, joint)] += 0.0 if piece.neutral else piece.tie
+        matrix[np.ix_(own, joint)] += 0.0 if piece.neutral else piece.ground_elastance
     phi = (1 - out)[:, None] * four_point_mean(found.points, green, "phi0")
     free = np.unique([g for g, p in zip(group, pieces, strict=True) if p.neutral])
     net = (group[found.owner][:, None] == free).astype(float)
@@ -101,7 +103,7 @@ def beyond(points: Array, room: Array) -> Array:
     """How far clusters (k, 4, 3) are out of reach, 0 to 1, by their middles."""
     middle = points.mean(axis=1)
     off = np.maximum(np.maximum(room[0] - middle, middle - room[1]), 0.0)
-    return np.array([_smooth(d / SHORE) for d in np.linalg.norm(off, axis=1)])
+    return np.array([_smooth(d / WALL_FADE_LENGTH) for d in np.linalg.norm(off, axis=1)])
 
 
 def interaction(found: Clusters, green: GreenFunction, out: Array) -> Array:
@@ -112,9 +114,11 @@ def interaction(found: Clusters, green: GreenFunction, out: Array) -> Array:
     psi = (1 - out)[:, None] * four_point_mean(found.points, green, "psi")
     image = found.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
     other = found.owner[:, None] != found.owner
-    between = np.where(other, inverse_distances(found.points, found.points, found.soft), 0.0)
-    images = inverse_distances(found.points, image, found.soft) + psi @ psi.T
-    return between - images + np.diag(BARRIER * out**3)
+    between = np.where(
+        other, inverse_distances(found.points, found.points, found.softening_length), 0.0
+    )
+    images = inverse_distances(found.points, image, found.softening_length) + psi @ psi.T
+    return between - images + np.diag(WALL_PENALTY * out**3)
 
 
 def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
@@ -172,30 +176,32 @@ def rectangle(center: Array, second: Array) -> tuple[Array, float]:
 # ---- charge functions ----
 
 
-def members(kids: Array, panel: Array) -> list[Array]:
+def members(children: Array, panel: Array) -> list[Array]:
     """Panels in each cluster, sorted."""
-    out: list[Array] = [np.empty(0, int)] * len(kids)
-    for k in range(len(kids) - 1, -1, -1):
-        if kids[k, 0] < 0:
+    out: list[Array] = [np.empty(0, int)] * len(children)
+    for k in range(len(children) - 1, -1, -1):
+        if children[k, 0] < 0:
             out[k] = np.array([panel[k]])
         else:
-            out[k] = np.sort(np.concatenate([out[kids[k, 0]], out[kids[k, 1]]]))
+            out[k] = np.sort(np.concatenate([out[children[k, 0]], out[children[k, 1]]]))
     return out
 
 
-def shares(kids: Array, panel: Array, charge: Array) -> Array:
+def shares(children: Array, panel: Array, charge: Array) -> Array:
     """The equilibrium ``charge`` (n,) within each cluster, as a column of sum one, (n, 2 n - 1)."""
-    out = np.zeros((len(charge), len(kids)))
-    for k, own in enumerate(members(kids, panel)):
+    out = np.zeros((len(charge), len(children)))
+    for k, own in enumerate(members(children, panel)):
         out[own, k] = charge[own] / charge[own].sum()
     return out
 
 
-def haar(kids: Array, panel: Array, charge: Array) -> Array:
+def haar(children: Array, panel: Array, charge: Array) -> Array:
     """Columns: equilibrium charge; then, cluster by cluster, one part minus the other, (n, n)."""
-    share = shares(kids, panel, charge)
-    split = kids[:, 0] >= 0
-    return np.column_stack([share[:, 0], share[:, kids[split, 0]] - share[:, kids[split, 1]]])
+    share = shares(children, panel, charge)
+    split = children[:, 0] >= 0
+    return np.column_stack(
+        [share[:, 0], share[:, children[split, 0]] - share[:, children[split, 1]]]
+    )
 
 
 class Chosen(NamedTuple):
@@ -221,9 +227,9 @@ def within_reach(
 
     ``out`` is how far each leaf is out of reach. A cluster that is wholly out has none.
     """
-    kids, _, charge = tree
-    amount = [charge[share[:, k] > 0].sum() for k in range(len(kids))]
-    leaves, split = chosen.leaves.tolist(), chosen.functions.tolist()
+    children, _, charge = tree
+    amount = [charge[share[:, k] > 0].sum() for k in range(len(children))]
+    leaves, split = chosen.active.tolist(), chosen.functions.tolist()
     inside: dict[int, float] = {}
     there: dict[int, float] = {}
     found: dict[int, tuple[Array, Array]] = {}
@@ -231,11 +237,13 @@ def within_reach(
         terms, rest = [], 1.0
         if k in leaves:
             j = leaves.index(k)
-            terms.append((chosen.whole[j] * (1 - out[j]), share[:, k], np.eye(len(leaves))[j]))
-            rest -= chosen.whole[j]
-            there[k] = chosen.whole[j] * (out[j] < 1.0)
+            terms.append(
+                (chosen.self_weight[j] * (1 - out[j]), share[:, k], np.eye(len(leaves))[j])
+            )
+            rest -= chosen.self_weight[j]
+            there[k] = chosen.self_weight[j] * (out[j] < 1.0)
         if k in split:
-            for part in kids[k].tolist():
+            for part in children[k].tolist():
                 if part in found:
                     weight = rest * amount[part] / amount[k] * inside[part]
                     terms.append((weight, *found[part]))
@@ -256,20 +264,20 @@ def reduced(
     green: GreenFunction,
     room: Array,
 ) -> tuple[Array, Array, Array]:
-    """ΔC and the part of it that is estimated, from chosen functions (kids, panel, charge), and
+    """ΔC and the part of it that is estimated, from chosen functions (children, panel, charge), and
     what panels are too coarse for."""
     share = [shares(*tree) for tree in trees]
-    found = clusters(pieces, [s[:, c.leaves] for s, c in zip(share, chosen, strict=True)])
+    found = clusters(pieces, [s[:, c.active] for s, c in zip(share, chosen, strict=True)])
     out = beyond(found.points, room)
     columns, blocks, fade, above, ends = [], [], [], [], []
     for b, (piece, tree, all_of, cut) in enumerate(zip(pieces, trees, share, chosen, strict=True)):
-        kids, own = tree[0], found.owner == b
+        children, own = tree[0], found.owner == b
         units, there = within_reach(tree, all_of, cut, out[own])
         used = [] if piece.neutral or 0 not in units else [units[0]]
         full = [_smooth(there[0] / FULL)] * len(used)
         net = len(used)
-        parted = [x in units and y in units for x, y in kids[cut.functions]]
-        for x, y in kids[cut.functions[parted]]:
+        parted = [x in units and y in units for x, y in children[cut.functions]]
+        for x, y in children[cut.functions[parted]]:
             used.append((units[x][0] - units[y][0], units[x][1] - units[y][1]))
             full.append(_smooth(min(there[x], there[y]) / FULL))
         functions = np.array([on for on, _ in used]).reshape(-1, len(piece.panels)).T
@@ -277,14 +285,14 @@ def reduced(
         spread[own] = np.array([on for _, on in used]).reshape(-1, own.sum()).T
         columns.append(spread)
         block = functions.T @ piece.block @ functions
-        block[:net, :net] += piece.tie
+        block[:net, :net] += piece.ground_elastance
         blocks.append(block)
         fade.append(full * np.concatenate([[1.0] * net, cut.fade[parted]]))
-        above.append(full * np.concatenate([[1.0] * net, cut.above[parted]]))
-        panels = (kids[kids[cut.functions[parted]]][..., 0] < 0).mean(axis=1)
+        above.append(full * np.concatenate([[1.0] * net, cut.parent_fade[parted]]))
+        panels = (children[children[cut.functions[parted]]][..., 0] < 0).mean(axis=1)
         members_out = [
             any(out[own][on != 0.0].max(initial=0.0) > 0.0 for on in (units[x][1], units[y][1]))
-            for x, y in kids[cut.functions[parted]]
+            for x, y in children[cut.functions[parted]]
         ]
         ends.append(np.concatenate([[0.0] * net, np.where(members_out, 0.0, panels)]))
     to_leaves = np.concatenate(columns, axis=1)
@@ -310,7 +318,7 @@ def reduced(
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
-LONG, SHORE, BEHIND = (0.03, 0.06), 5e-3, 4e-3
+LONG, WALL_FADE_LENGTH, BEHIND = (0.03, 0.06), 5e-3, 4e-3
 """The first two in a domain of 0.5 m."""
 CLOSE, GROWTH, USUAL = (8e-3, 12e-3), 0.2, 0.015
 
@@ -331,18 +339,18 @@ def scores(
     linear_from = np.array(LINEAR) * max(1.0, (threshold / USUAL) ** (1 / 3))
     seen, stiff = [], []
     energy = np.zeros(green.far_phi.shape[1])
-    for piece, (kids, panel, charge) in zip(pieces, trees, strict=True):
-        share = shares(kids, panel, charge)
+    for piece, (children, panel, charge) in zip(pieces, trees, strict=True):
+        share = shares(children, panel, charge)
         block = free_block(piece.panels) / piece.scale
-        means, looks = _means(piece, kids, share, green, packed, linear_from)
-        linear = {k: look.linear for k, look in looks.items()}
+        means, looks = _means(piece, children, share, green, packed, linear_from)
+        linear = {k: look.linearity for k, look in looks.items()}
         net = 0.0
-        own, told = np.zeros(len(kids)), np.ones(len(kids))
+        own, told = np.zeros(len(children)), np.ones(len(children))
         for k in sorted(means):
-            if kids[k, 0] >= 0:
-                told[kids[k]] = told[k] * (1 - linear[k])
+            if children[k, 0] >= 0:
+                told[children[k]] = told[k] * (1 - linear[k])
         for k, value in means.items():
-            x, y = kids[k]
+            x, y = children[k]
             if x >= 0 and x in means:
                 function = share[:, x] - share[:, y]
                 own[k] = function @ block @ function
@@ -354,39 +362,41 @@ def scores(
                 value = means[x] - means[y]
                 energy += told[k] * (1 - linear[k]) * value**2 / own[k]
         if not piece.neutral:
-            net = means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.tie)
+            net = means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.ground_elastance)
             energy += net
         seen.append((means, linear, looks, net, piece.neutral and piece.group is None))
         stiff.append(own)
     weight = 1 / (energy + 0.01 * np.linalg.norm(energy))
     out = []
-    for (*found, net, neutral), own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
+    for (*found, net, neutral), own, (children, _, _) in zip(seen, stiff, trees, strict=True):
         means, linear, looks = found
-        score = np.zeros(len(kids))
+        score = np.zeros(len(children))
         for k in means:
             if own[k] > 0:
-                x, y = kids[k]
-                value = weight @ (means[x] - means[y]) ** 2 / (own[k] * looks[k].stiff ** 3)
+                x, y = children[k]
+                value = (
+                    weight @ (means[x] - means[y]) ** 2 / (own[k] * looks[k].screening_factor ** 3)
+                )
                 for below in (score[x], score[y]):
                     value = max(value, below) + 0.5 * min(value, below)
                 score[k] = (1 - linear[k]) * value
-        score[0] = max(score[0], looks[0].crossing * np.sum(weight * net))
-        seen, told = np.ones(len(kids)), np.ones(len(kids))
-        for k in range(len(kids)):
-            for part in kids[k]:
-                if part >= 0 and kids[part, 0] >= 0:
+        score[0] = max(score[0], looks[0].wall_crossing_weight * np.sum(weight * net))
+        seen, told = np.ones(len(children)), np.ones(len(children))
+        for k in range(len(children)):
+            for part in children[k]:
+                if part >= 0 and children[part, 0] >= 0:
                     seen[part] = seen[k] * _smooth((1 - linear.get(k, 1.0)) / SEEN)
                     told[part] = told[k] * (1 - linear.get(k, 1.0))
                     rest = 1 - told[part] * (1 - linear.get(part, 1.0))
                     score[part] = told[part] * score[part] + rest * DECAY * score[k]
         whole = score[0]
-        for k in reversed(range(len(kids))):
+        for k in reversed(range(len(children))):
             if k in looks:
                 large = _smooth((looks[k].size - LARGE[0]) / (LARGE[1] - LARGE[0]))
                 forced = min(CROSSED, 2.5 * whole) if neutral else CROSSED
                 least = max(whole * looks[k].size / looks[0].size, forced * large)
-                score[k] = max(score[k], seen[k] * looks[k].crossing * least)
-            score[k] = max([score[k], *(score[p] for p in kids[k] if p >= 0)])
+                score[k] = max(score[k], seen[k] * looks[k].wall_crossing_weight * least)
+            score[k] = max([score[k], *(score[p] for p in children[k] if p >= 0)])
         out.append(score)
     return out
 
@@ -430,14 +440,14 @@ def _smooth(x: float) -> float:
 
 def _means(
     piece: Piece,
-    kids: Array,
+    children: Array,
     share: Array,
     green: GreenFunction,
     packed: Green,
     linear_from: Array,
 ) -> tuple[dict[int, Array], dict[int, Look]]:
     """Potentials in the centres of the clusters that are looked at, finest first, and the looks."""
-    room = packed.room
+    room = packed.active_bounds
     sources = green.far_sources.astype(float)
     image = sources * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
     out, looks = {}, {}
@@ -452,7 +462,7 @@ def _means(
         close = _smooth((CLOSE[1] - green.distance(point[None])[0]) / (CLOSE[1] - CLOSE[0]))
         out[k] = (1 - close) * tabulated(packed.grid, point)[: green.far_phi.shape[1]]
         out[k] += close * (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
-        within = 1 - _smooth(off / SHORE)
+        within = 1 - _smooth(off / WALL_FADE_LENGTH)
         out[k] *= within
         crossing = _smooth(2 - 4 * abs(inside) / size)
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
@@ -462,6 +472,6 @@ def _means(
         front = _smooth(1 + (point[2] - green.box[1, 2]) / BEHIND)
         stiff = 1 - front * math.exp(-2 * math.pi * off / size)
         looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, stiff, size)
-        if kids[k, 0] >= 0 and looks[k].linear < 1:
-            wanted += kids[k].tolist()
+        if children[k, 0] >= 0 and looks[k].linearity < 1:
+            wanted += children[k].tolist()
     return {k: out[k] for k in sorted(out, reverse=True)}, looks

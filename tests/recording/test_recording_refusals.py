@@ -15,7 +15,7 @@ import recorded_scenes
 import capsense as cs
 from capsense.errors import MissingDependencyError, ReadoutError, RecordingError
 from capsense.scene import Shape
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.surface_solver import SurfaceSolver
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._thread_pool import OneAtATime
+from capsense._thread_pool import ForkSafeRLock
 from capsense._validate import suggest
 from capsense.adapters.contacts import Contact
 from capsense.adapters.placement import FAR, blind, buried, far_off, felt, placement, turned_round
@@ -48,7 +48,7 @@ class AttachedSensor(ABC):
         self.readout: Readout | None = simulator.readout
         """The chip that turns capacitances into counts, if any; a simulator's own is taken over."""
         simulator.use_readout(None)
-        self._one = OneAtATime()
+        self._one = ForkSafeRLock()
 
     def read(self, time: float | None = None, view: Scene | DepthFrame | None = None) -> Reading:
         """The reading of the simulator's present state.

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
-from capsense.elements.matter import matter_of
 from capsense.errors import SceneError, listed
 from capsense.fleet import Fleet, FleetReading, Preset
 from capsense.scene import Body
+from capsense.solver.tree.matter import matter_of
 
 Fixed = tuple[NDArray[np.integer], NDArray[np.floating]]
 """Numbers of bodies, -1 for the world itself, and poses on them (x, y, z [m]; quaternion x, y, z,

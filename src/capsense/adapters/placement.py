@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
-from capsense.elements.wide import wide_pieces
 from capsense.errors import CapSenseError, listed
 from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import Contacts, distances, find_contacts, points_on
 from capsense.scene.shapes import ShapeKind
 from capsense.simulator import Simulator
-from capsense.surface.solver import PRESETS
+from capsense.solver.surface_solver import PRESETS
+from capsense.solver.tree.fine_panels import wide_pieces
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from capsense._thread_pool import OneAtATime, ThreadPool
+from capsense._thread_pool import ForkSafeRLock, ThreadPool
 from capsense._validate import suggest
 from capsense.adapters import GeometrySensor
 from capsense.adapters.placement import blind
@@ -44,7 +44,7 @@ class AttachedSkin:
         self.sensors = dict(sensors)
         """The sensors, as ``attach`` makes them."""
         self._source = next(iter(self.sensors.values())).source
-        self._pool, self._one = ThreadPool(threads), OneAtATime()
+        self._pool, self._one = ThreadPool(threads), ForkSafeRLock()
         for sensor in self.sensors.values():
             sensor.use_readout(readout)
         first = next(iter(self.sensors.values())).readout

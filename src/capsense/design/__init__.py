@@ -36,10 +36,14 @@ from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, R
 from capsense.design.shapes import SHAPES, box_surface, cylinder_surface, planar_surface
 from capsense.errors import DesignError
 
-LAYER_EPS_R: dict[str, float] = read_toml(
-    Path(__file__).with_name("materials.toml"), "material", DesignError
-)
-"""Relative permittivity by material name (lower case)."""
+LAYER_EPS_R: dict[str, float] = {
+    name.lower(): table["eps_r"]
+    for name, table in read_toml(
+        Path(__file__).parents[1] / "materials.toml", "material", DesignError
+    )["materials"].items()
+    if "sigma" not in table
+}
+"""Relative permittivity of the insulators among the materials by name (lower case)."""
 
 LAYER_KEYS = ("name", "material", "eps_r")
 SOLIDS: dict[str, tuple[tuple[str, ...], Callable[[DesignTable, Placement], Surface]]] = {

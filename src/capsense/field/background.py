@@ -133,7 +133,7 @@ def build_background(
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class CapacitanceChange:
     """What a scene changes in the Maxwell matrix of all terminals."""
 
     matrix: Array

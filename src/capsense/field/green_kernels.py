@@ -1,5 +1,4 @@
-"""Green's function as compiled code takes it: potentials of its point charges, eight at a time, and
-where points stand to the design and the walls.
+"""Green's function as compiled code takes it: potentials of its point charges, eight at a time.
 
 Lengths in metres, 4π eps0 = 1; symbols as in ``docs/theory.md``.
 """
@@ -30,6 +29,7 @@ from capsense._simd import (
 )
 from capsense.design.model import Design
 from capsense.field.face import cover_of, face_box
+from capsense.field.face_kernels import Space, smooth
 from capsense.field.gap_table import GapTable
 from capsense.field.green import LEVELS, GreenFunction
 from capsense.field.grid_kernels import Grid, grid_over
@@ -38,12 +38,6 @@ from capsense.field.soft import Soft, no_soft, pack_soft
 LEAST = 1e-3, 2e-3, 3e-3
 """Distances from near, middle and far sources [m] below which their potential grows no more. They
 lie deeper than that under the surfaces of the design."""
-SHORE = 0.01
-"""Bodies fade out over this distance beyond the room, and behind the face of a flat design, over
-the domain's shortest side."""
-DEEP, STEEP = (2.3, 3.8), 4.0
-"""What is deeper behind the face of a flat design than the first of these, over the validity
-distance, comes to be screened by it, over the second; depth from the sides counts so many times."""
 _AWAY = 1e3
 """Coordinates of sources without charge [m]."""
 MARGIN = 0.03
@@ -148,22 +142,6 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     )  # fmt: skip
 
 
-class Space(NamedTuple):
-    """What single points need of a :class:`Green`: kernels that are called for each take this.
-
-    All of its arrays, handed on, take longer than what such a kernel works out.
-    """
-
-    face: NDArray[Any]
-    curvature: float
-    room: NDArray[Any]
-    extent: float
-    cover: float
-    validity: float
-    limit: float
-    """Largest compression of the cover [m]."""
-
-
 class Green(NamedTuple):
     """A design's Green's function, as the kernels take it."""
 
@@ -173,7 +151,7 @@ class Green(NamedTuple):
     """φ⁰ alone, from the last of these, shape (f, lead)."""
     grid: Grid
     """The same as a table over the domain, roughly."""
-    lead: int
+    phi_columns: int
     """Columns of φ⁰, padded."""
     terminals: int
     """How many of them are terminals."""
@@ -185,34 +163,14 @@ class Green(NamedTuple):
     """Corners of the design [m], shape (2, 3)."""
     blends: NDArray[Any]
     """Distances [m] from ``box`` between which a level gives way to the next one, shape (2, 2)."""
-    room: NDArray[Any]
+    active_bounds: NDArray[Any]
     """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
     extent: float
     """Shortest side of the domain [m]."""
-    cover: float
-    """Thickness of what covers the electrodes [m]; infinite for designs without a face."""
     gap: Gap
     """The first millimetres in front of a design."""
     space: Space
     """What single points need of all this."""
-
-
-@kernel
-def on_face(x, y, z, curvature):
-    """Coordinates of the face of a point of the sensor frame [m]."""
-    if curvature == 0.0:
-        return x, y, z
-    up = z + 1.0 / curvature
-    return math.atan2(x, up) / curvature, y, math.sqrt(x * x + up * up) - 1.0 / curvature
-
-
-@kernel
-def off_face(x, y, z, curvature):
-    """Point of the sensor frame of coordinates of the face [m]."""
-    if curvature == 0.0:
-        return x, y, z
-    far, angle = z + 1.0 / curvature, x * curvature
-    return far * math.sin(angle), y, far * math.cos(angle) - 1.0 / curvature
 
 
 _PACKED: WeakKeyDictionary[GreenFunction, tuple[Design, Green]] = WeakKeyDictionary()
@@ -232,7 +190,7 @@ def _packed(green: GreenFunction, design: Design) -> Green:
     margin = 0.0 if design.domain.open else MARGIN * extent
     room = design.domain.sight + margin * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
     terminals = green.near_phi.shape[1]
-    lead = 8 * -(-terminals // 8)
+    phi_columns = 8 * -(-terminals // 8)
 
     def level(name: str, least: float) -> Level:
         positions, phi, modes = (
@@ -240,29 +198,39 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         )
         sources = np.full((3, _padded(len(positions))), _AWAY, np.float32)
         sources[:, : len(positions)] = positions.T
-        table = np.zeros((_padded(len(phi)), _padded(lead + modes.shape[1])), np.float32)
+        table = np.zeros((_padded(len(phi)), _padded(phi_columns + modes.shape[1])), np.float32)
         table[: len(phi), :terminals] = phi
-        table[: len(phi), lead : lead + modes.shape[1]] = modes
+        table[: len(phi), phi_columns : phi_columns + modes.shape[1]] = modes
         return Level(sources, table, least)
 
     near, middle, far = map(level, LEVELS, LEAST)
-    score_table = np.ascontiguousarray(far.table[:, :lead])
+    score_table = np.ascontiguousarray(far.table[:, :phi_columns])
     limits = np.float32(green.floor), np.float32(far.least)
 
     def phi(points: NDArray[np.float64]) -> NDArray[np.float32]:
         columns = np.full((3, _padded(len(points))), _AWAY, np.float32)
         columns[:, : len(points)] = points.T
-        out = np.empty((lead, columns.shape[1]), np.float32)
+        out = np.empty((phi_columns, columns.shape[1]), np.float32)
         point_potentials(columns, far.sources, score_table, limits, out)
         return np.clip(out[:, : len(points)].T, 0.0, 1.0)
 
-    gap, cover = pack_gap(green.gap, green.clearance, design), cover_of(design)
-    space = Space(gap.face, gap.curvature, room, extent, cover, gap.validity, gap.soft.limit)
+    gap, has_face = pack_gap(green.gap, green.clearance, design), math.isfinite(cover_of(design))
+    space = Space(has_face, gap.face, gap.curvature, room, extent, gap.validity, gap.soft.limit)
     return Green(
-        (near, middle, far), score_table, grid_over(np.asarray(green.box, float), walls, phi),
-        lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blends, float), room, extent, cover, gap, space,
-    )  # fmt: skip
+        (near, middle, far),
+        score_table,
+        grid_over(np.asarray(green.box, float), walls, phi),
+        phi_columns,
+        terminals,
+        len(design.electrodes),
+        float(green.floor),
+        np.asarray(green.box, float),
+        np.asarray(green.blends, float),
+        room,
+        extent,
+        gap,
+        space,
+    )
 
 
 def _padded(count: int) -> int:
@@ -344,110 +312,6 @@ def _potential(x, y, z, sx, sy, up, down, bound):
     square = vmadd(dz, dz, across)
     direct = rsqrt(where_above(square, bound, square, bound))
     return vsub(direct, rsqrt(vmadd(ez, ez, across)))
-
-
-@kernel
-def smooth(x):
-    """Smoothstep: 0 up to 0, 1 from 1 on."""
-    x = min(1.0, max(0.0, x))
-    return x * x * (3.0 - 2.0 * x)
-
-
-@kernel
-def beyond(points, space, middle):
-    """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face.
-
-    ``middle`` is room for a point, shape (3,).
-    """
-    out, depth = 0.0, math.inf
-    for i in range(3):
-        c = 0.5 * (points[0, i] + points[3, i])
-        off = max(space.room[0, i] - c, c - space.room[1, i], 0.0)
-        out += off * off
-        middle[i] = c
-    _put(middle, on_face(middle[0], middle[1], middle[2], space.curvature))
-    for i in range(3):
-        c = middle[i]
-        if i < 2:
-            depth = min(depth, STEEP * (c - space.face[0, i]), STEEP * (space.face[1, i] - c))
-        else:
-            depth = min(depth, space.face[1, 2] - space.limit - c)
-    deep = (depth / space.validity - DEEP[0]) / DEEP[1] if space.cover < 1.0 else 0.0
-    return smooth(max(math.sqrt(out) / (SHORE * space.extent), deep))
-
-
-@kernel
-def held_off(distance, length):
-    """A distance that becomes ``length`` in contact, and stays from twice that on, C¹ [m]."""
-    if distance >= 2.0 * length:
-        return distance
-    return length + distance * distance / (4.0 * length)
-
-
-@kernel
-def settle(points, space):
-    """Move points (k, 3) in the cover up to its face: what is pressed into it is in contact."""
-    for q in range(points.shape[0]):
-        depth = space.face[1, 2] - points[q, 2]
-        if 0.0 < depth <= space.limit:
-            inside = True
-            for i in range(2):
-                x = points[q, i]
-                inside = inside and space.face[0, i] < x < space.face[1, i]
-            if inside:
-                points[q, 2] = space.face[1, 2]
-
-
-@kernel
-def _put(out, point):
-    out[0], out[1], out[2] = point
-
-
-@kernel
-def keep_off(points, space):
-    """Settle and lift points (k, 3) of the sensor frame, in front of a design with a face."""
-    bent = space.curvature != 0.0
-    if bent:
-        for q in range(points.shape[0]):
-            p = points[q]
-            _put(p, on_face(p[0], p[1], p[2], space.curvature))
-    settle(points, space)
-    lift(points, space.validity, space.face)
-    if bent:
-        for q in range(points.shape[0]):
-            p = points[q]
-            _put(p, off_face(p[0], p[1], p[2], space.curvature))
-
-
-@kernel
-def lift(points, gap, box):
-    """Keep points (k, 3) off a design: a distance d < 2 gap becomes gap + d² / (4 gap).
-
-    Points and ``box`` are in coordinates of the face. The space behind the design counts as within
-    it.
-    """
-    for q in range(points.shape[0]):
-        square, depth, axis, side = 0.0, 1.0, 2, 1
-        for i in range(3):
-            for k in range(2):
-                if i == 2 and k == 0:
-                    continue
-                off = points[q, i] - box[1, i] if k == 1 else box[0, i] - points[q, i]
-                square += max(off, 0.0) ** 2
-                if -off < depth:
-                    depth, axis, side = -off, i, k
-        way = math.sqrt(square)
-        if way >= 2.0 * gap:
-            continue
-        if way == 0.0:
-            points[q, axis] = box[1, axis] + gap if side == 1 else box[0, axis] - gap
-            continue
-        ratio = held_off(way, gap) / way
-        for i in range(3):
-            edge = min(points[q, i], box[1, i])
-            if i < 2:
-                edge = max(edge, box[0, i])
-            points[q, i] = edge + ratio * (points[q, i] - edge)
 
 
 @compiled

@@ -231,10 +231,10 @@ def reachable_points(surface: Surroundings, sources: Array, clearance: float, co
         ]
     )
     margin = 0.02 * (upper - lower)
-    reached = ((points > lower + margin) & (points < upper - margin)).all(axis=1)
+    truncate_to_domain = ((points > lower + margin) & (points < upper - margin)).all(axis=1)
     for layer in design.layers:
-        reached &= ~layer.contains(points)
-    points = points[reached & ~_shut(design, points)]
+        truncate_to_domain &= ~layer.contains(points)
+    points = points[truncate_to_domain & ~_shut(design, points)]
     distance, nearest = surface.tree.query(points)
     apart = distance > clearance * surface.coarseness[nearest] ** 0.5
     apart &= cKDTree(sources).query(points)[0] > 0.6 * distance

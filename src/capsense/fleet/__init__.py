@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._thread_pool import OneAtATime
+from capsense._thread_pool import ForkSafeRLock
 from capsense._validate import as_whole, checked_frequency, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.elements.wide import WIDE
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
@@ -36,7 +35,8 @@ from capsense.readout import Readout
 from capsense.readout.conversions import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
-from capsense.surface.solver import PRESETS, SurfaceSolver
+from capsense.solver.surface_solver import PRESETS, SurfaceSolver
+from capsense.solver.tree.fine_panels import WIDE
 
 if TYPE_CHECKING:
     from capsense.fleet.warp_core import WarpCore
@@ -130,7 +130,7 @@ class Fleet:
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self.table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
-        self._one, self._warned = OneAtATime(), False
+        self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_whole, shorten
-from capsense.elements.matter import matter_of
-from capsense.elements.outline import write_outline
-from capsense.elements.panels import windowed
-from capsense.elements.pieces import ChangingBody
-from capsense.elements.rigid import BODY, RigidShape
 from capsense.errors import SceneError
 from capsense.readout.conversions import Held
 from capsense.scene import Body, Layers, Pose, Scene, SurfaceMesh
 from capsense.simulator import Simulator
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.bodies.outline import write_outline
+from capsense.solver.bodies.panels import windowed
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.matter import matter_of
+from capsense.solver.tree.rigid import BODY, RigidShape
 
 if TYPE_CHECKING:
     from capsense.fleet import Fleet, Preset
@@ -111,22 +111,22 @@ class Bodies(NamedTuple):
     """
 
     shapes: NDArray[Any]
-    """Shapes, of size 1, as records of ``elements.rigid.BODY``, shape (u,)."""
+    """Shapes, of size 1, as records of ``solver.tree.rigid.BODY``, shape (u,)."""
     radius: NDArray[Any]
     """Radius of a ball about each shape's origin that holds it [m], shape (u,)."""
     choice: NDArray[Any]
     """Shape in each place, -1 where nothing is, shape (e, b)."""
     scale: NDArray[Any]
     """How many times as large it is, shape (e, b)."""
-    softness: NDArray[Any]
+    inverse_susceptibility: NDArray[Any]
     """1 / (eps - 1), complex, 0 for conductors, shape (e, b)."""
-    tie: NDArray[Any]
+    ground_elastance: NDArray[Any]
     """Energy that ties it to ground [1/m], complex, shape (e, b)."""
     neutral: NDArray[Any]
     """Whether it has no net charge, shape (e, b)."""
     slack: NDArray[Any]
     """Half of what is cut off of a long body along each axis [m], shape (e, b, 3); what is left is
-    nearest to the middle of the domain, see ``elements.pieces.windowed``."""
+    nearest to the middle of the domain, see ``solver.tree.dynamic_surface.windowed``."""
     hidden: NDArray[Any]
     """Whether a sensor does not see a place, shape (s, b)."""
     group: NDArray[Any]
@@ -144,7 +144,7 @@ class BodyTable:
     def __init__(self, solver: SurfaceSolver, count: int, places: int, sensors: int) -> None:
         self._solver = solver
         self.count, self.places, self.sensors = count, places, sensors
-        self.shapes: list[RigidShape | ChangingBody] = []
+        self.shapes: list[RigidShape | DynamicBody] = []
         """Those in the table, in its order; records point to their arrays."""
         self._kinds: dict[tuple[int, bool], int] = {}
         shape = count, places
@@ -237,7 +237,10 @@ class BodyTable:
     def lossy(self) -> bool:
         """Whether any matter has losses."""
         table = self.bodies
-        return bool((table.softness.imag != 0).any() or (table.tie.imag != 0).any())
+        return bool(
+            (table.inverse_susceptibility.imag != 0).any()
+            or (table.ground_elastance.imag != 0).any()
+        )
 
     def _row(self, body: Body | None) -> tuple[int, float, complex, complex, int, Array]:
         """Shape, scale, softness, tie and neutrality of a body, and what is cut off of it."""
@@ -255,12 +258,12 @@ class BodyTable:
         shape, size = self._solver.functions_of(window, bool(matter.conducting[0]))
         tie = complex(matter.ties(np.array([size * shape.capacitance]))[0])
         neutral = int(np.isinf(tie.real))
-        soft = complex(matter.softness[0])
+        soft = complex(matter.inverse_susceptibility[0])
         number = self._number(shape, soft != 0.0)
         cut = 0.5 * np.ptp(whole.bounds(), axis=0) - 0.5 * np.ptp(window.bounds(), axis=0)
         return number, size, soft, 0.0 if neutral else tie, neutral, cut
 
-    def _number(self, shape: RigidShape | ChangingBody, soft: bool) -> int:
+    def _number(self, shape: RigidShape | DynamicBody, soft: bool) -> int:
         """The number of a shape in the table, which it joins if it is new."""
         found = self._kinds.setdefault((id(shape), soft), len(self._kinds))
         if found == len(self.shapes):
@@ -272,11 +275,11 @@ class BodyTable:
         return found
 
 
-def _record(shape: RigidShape | ChangingBody, soft: bool) -> NDArray[Any]:
+def _record(shape: RigidShape | DynamicBody, soft: bool) -> NDArray[Any]:
     """What the kernels take of a shape, with its inside if it is soft; points to its arrays."""
     record = np.array([shape.record], BODY)
-    if soft and (block := shape.impedance) is not None:
-        record["impedance"], record["known"] = block.ctypes.data, len(block)
+    if soft and (block := shape.neumann_to_dirichlet) is not None:
+        record["neumann_to_dirichlet"], record["n_tabulated"] = block.ctypes.data, len(block)
     return record
 
 

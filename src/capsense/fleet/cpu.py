@@ -1,6 +1,6 @@
 """A fleet's step on the CPU: environments on all processors, those with losses one by one.
 
-What is compiled solves each as :mod:`capsense.surface.step` does it.
+What is compiled solves each as :mod:`capsense.solver.system.step` does it.
 """
 
 from __future__ import annotations
@@ -10,19 +10,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled, first_use, kernel
+from capsense._jit import compiled, kernel
 from capsense._thread_pool import in_parts
-from capsense.elements.matter import SHUT, UNIT
-from capsense.elements.rigid import BODY, HALF_SPACE
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
-from capsense.field.green_kernels import SHORE, Green
+from capsense.field.face_kernels import WALL_FADE_LENGTH
+from capsense.field.green_kernels import Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading, FleetTouch
-from capsense.surface.gap_kernels import near_bodies
-from capsense.surface.lossy import solve_lossy
-from capsense.surface.solver import SurfaceSolver
-from capsense.surface.step import slopes_of, solve
-from capsense.surface.touch_kernels import Foundation, press
+from capsense.solver.gap.gap_kernels import near_bodies
+from capsense.solver.gap.touch_kernels import Foundation, press
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.system.lossy import solve_lossy
+from capsense.solver.system.step import slopes_of, solve
+from capsense.solver.tree.matter import FLOATING_PENALTY, UNIT
+from capsense.solver.tree.rigid import BODY, HALF_SPACE
 
 Array = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ class Sensor(NamedTuple):
     """Green's function of the design, of m terminals."""
     threshold: float
     width: float
-    """As :func:`capsense.surface.step.solve` takes them."""
+    """As :func:`capsense.solver.system.step.solve` takes them."""
     cover: Foundation
     """Its cover; without pressures where it has none."""
 
@@ -87,10 +88,21 @@ def _step_rows(
     turn = np.empty((3, 3))
     for e in range(start, stop):
         for s in range(sensors):
-            count = _seen(bodies, poses, e, s, (green.room, SHORE * green.extent), room, place)
+            count = _seen(
+                bodies,
+                poses,
+                e,
+                s,
+                (green.active_bounds, WALL_FADE_LENGTH * green.extent),
+                room,
+                place,
+            )
             for c in range(count):
                 b = place[c]
-                if bodies.softness[e, b].imag != 0.0 or bodies.tie[e, b].imag != 0.0:
+                if (
+                    bodies.inverse_susceptibility[e, b].imag != 0.0
+                    or bodies.ground_elastance[e, b].imag != 0.0
+                ):
                     found.lossy[e, s] = True
             if sensor.cover.strain.shape[0] > 0 and count > 0:
                 found.total[e, s] = press(
@@ -161,18 +173,20 @@ def _connect(bodies: Bodies, e: int, records: Any, place: Any, c: int) -> None:
             leader, others = min(leader, d), True
     records[c].group = leader
     if leader < c:  # which has the tie of all by now
-        records[c].tie, records[c].neutral = records[leader].tie, 0
+        records[c].ground_elastance, records[c].neutral = records[leader].ground_elastance, 0
         return
     grounded, ground = False, 0.0
     for b in range(groups.shape[0]):
         if groups[b] == mine and bodies.choice[e, b] >= 0 and not neutral[b]:
-            tie = bodies.tie[e, b].real
+            tie = bodies.ground_elastance[e, b].real
             grounded = grounded or tie == 0.0
             ground += 1.0 / tie if tie > 0.0 else 0.0
             others = others or b != place[c]
     if others:
         records[c].neutral = 0
-        records[c].tie = 0.0 if grounded else 1.0 / ground if ground > 0.0 else SHUT
+        records[c].ground_elastance = (
+            0.0 if grounded else 1.0 / ground if ground > 0.0 else FLOATING_PENALTY
+        )
 
 
 @kernel
@@ -227,11 +241,14 @@ def _placed(
         at = body.position[i]
         if at + reach < room[0, i] or at - reach > room[1, i]:
             return False
-    body.scale, body.tie = scale, bodies.tie[e, b].real
-    body.neutral, body.softness = bodies.neutral[e, b], bodies.softness[e, b].real
-    body.stiffer = HALF_SPACE * abs(bodies.softness[e, b])
-    if bodies.softness[e, b] == 0.0:
-        body.impedance = 0
+    body.scale, body.ground_elastance = scale, bodies.ground_elastance[e, b].real
+    body.neutral, body.inverse_susceptibility = (
+        bodies.neutral[e, b],
+        bodies.inverse_susceptibility[e, b].real,
+    )
+    body.polarization_stiffness = HALF_SPACE * abs(bodies.inverse_susceptibility[e, b])
+    if bodies.inverse_susceptibility[e, b] == 0.0:
+        body.neumann_to_dirichlet = 0
     return True
 
 
@@ -275,9 +292,8 @@ class CpuCore:
             np.zeros(own), np.zeros(own), np.zeros((e, s)),
         )  # fmt: skip
         sensor = Sensor(green, solver.preset.threshold, solver.preset.width, cover)
-        with first_use():
-            in_parts(_step_rows, e, self._table.bodies, where, sensor, found)
-            loss = self._lossy(where, found)
+        in_parts(_step_rows, e, self._table.bodies, where, sensor, found)
+        loss = self._lossy(where, found)
         failed = np.flatnonzero(~np.isfinite(found.delta).all(axis=(1, 2, 3)))
         if len(failed):
             raise SolveError(
@@ -307,7 +323,7 @@ class CpuCore:
 
         These are conductors where some matter has losses. On Warp they are dielectrics, too,
         conductors that are not at ground beyond the number of ``nodes``, and all bodies near a bent
-        film, which are not even lifted; see ``surface.gap_kernels``.
+        film, which are not even lifted; see ``solver.gap.gap_kernels``.
 
         Args:
             bodies, sensors: Poses, shapes (e, b, 7) and (e, s, 7).
@@ -317,7 +333,7 @@ class CpuCore:
         solver, table = self._solver, self._table.bodies
         where = _in_units(solver, bodies, sensors, self._table.forces)
         green = solver.green
-        sight = green.room, SHORE * green.extent
+        sight = green.active_bounds, WALL_FADE_LENGTH * green.extent
         records = np.empty(table.choice.shape[1], BODY)
         place = np.empty(len(records), np.int64)
         out = np.zeros((len(rows), sensors.shape[1]), np.bool_)
@@ -325,14 +341,14 @@ class CpuCore:
             e = int(rows[k])
             some = records[: _seen(table, where, e, s, sight, records, place)].copy()
             at = place[: len(some)]
-            soft, ties = table.softness[e, at], table.tie[e, at]
-            some["softness"] = 0.0
+            soft, ties = table.inverse_susceptibility[e, at], table.ground_elastance[e, at]
+            some["inverse_susceptibility"] = 0.0
             near = near_bodies(some, green)
             metal = near & (soft == 0.0)
             lossy = (soft.imag != 0.0).any() or (ties.imag != 0.0).any()
             out[k, s] = metal.any() and lossy
             if nodes is not None:
-                loose = metal & ((some["neutral"] != 0) | (some["tie"] > 0.0))
+                loose = metal & ((some["neutral"] != 0) | (some["ground_elastance"] > 0.0))
                 bent = green.gap.curvature != 0.0
                 out[k, s] |= (near & (bent | ~metal)).any()
                 out[k, s] |= len(set(some["group"][loose])) > nodes
@@ -352,7 +368,7 @@ class CpuCore:
                 where,
                 e,
                 s,
-                (solver.green.room, SHORE * solver.green.extent),
+                (solver.green.active_bounds, WALL_FADE_LENGTH * solver.green.extent),
                 records,
                 place,
             )
@@ -360,8 +376,12 @@ class CpuCore:
             if len(solver.cover.strain):
                 unused = np.empty((2, found.force.shape[-1]))
                 press(records[:count], where.forces[e][at], solver.cover, *unused)
-            soft, lone = bodies.softness[e, at], records["neutral"][:count] != 0
-            ties = np.where(bodies.tie[e, at].imag != 0, bodies.tie[e, at], records["tie"][:count])
+            soft, lone = bodies.inverse_susceptibility[e, at], records["neutral"][:count] != 0
+            ties = np.where(
+                bodies.ground_elastance[e, at].imag != 0,
+                bodies.ground_elastance[e, at],
+                records["ground_elastance"][:count],
+            )
             out = solve_lossy(
                 records[:count], np.where(lone, np.inf, ties), soft, solver.green,
                 preset.threshold, preset.width,

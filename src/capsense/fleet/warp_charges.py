@@ -3,14 +3,15 @@ would add, and how the matrices change as bodies move, by the closed adjoint.
 
 Every cluster that is not split has one more function, the difference of its two parts. It adds the
 energy that the potential which the charges leave has in it alone, times ``GAIN``, as functions
-below the cut do in :mod:`capsense.surface.solve_kernels`. Its own energy is that in free space, and
-in charge that is out of reach.
+below the cut do in :mod:`capsense.solver.system.system_kernels`. Its own energy is that in free
+space, and in charge that is out of reach.
 
-For derivatives, as in :mod:`capsense.surface.gradient_kernels`, charges are held while they move in
-the field of the other charges, of all images and of the design; what changes with the share of near
-sources or with the lift off the design is left out, as there. The charges are those solved for,
-x = A⁻¹ Φ, those of the estimate on the parts of clusters, y = D (φ - B x), and what these take from
-the first, -A⁻¹ Bᵀ y: see ``solve_kernels._add_adjoint``. Floating conductors of the design follow.
+For derivatives, as in :mod:`capsense.solver.gradients.gradient_kernels`, charges are held while
+they move in the field of the other charges, of all images and of the design; what changes with the
+share of near sources or with the lift off the design is left out, as there. The charges are those
+solved for, x = A⁻¹ Φ, those of the estimate on the parts of clusters, y = D (φ - B x), and what
+these take from the first, -A⁻¹ Bᵀ y: see ``system_kernels._add_adjoint``. Floating conductors of
+the design follow.
 
 What has a column for each terminal has ``2 lead`` columns: real parts, then imaginary ones, which
 mean something in views with losses only; for derivatives, real parts alone. Lengths in metres,
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.fleet.warp_cut import SOURCES, Places, Response, Shapes, WarpCut, idle, many
+from capsense.fleet.warp_cut import SOURCES, Places, Response, Shapes, WarpActiveTree, idle, many
 from capsense.fleet.warp_pairs import (
     COLUMNS,
     Leaf,
@@ -36,27 +37,27 @@ from capsense.fleet.warp_pairs import (
     some,
 )  # fmt: skip
 from capsense.fleet.warp_solve import Left, own, times
-from capsense.surface.pair_kernels import BARRIER
-from capsense.surface.solve_kernels import COARSE, GAIN
+from capsense.solver.interaction.pair_kernels import WALL_PENALTY
+from capsense.solver.system.system_kernels import COARSE, GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 _SOURCES, _COLUMNS = wp.constant(SOURCES), wp.constant(COLUMNS)
-_BARRIER, _COARSE, _GAIN = (wp.constant(x) for x in (BARRIER, COARSE, GAIN))
+_WALL_PENALTY, _COARSE, _GAIN = (wp.constant(x) for x in (WALL_PENALTY, COARSE, GAIN))
 
 
 @wp.kernel
 def coarse(
-    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
+    cut: WarpActiveTree, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
     charge: wp.array3d(dtype=wp.float32), out: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """What panels are too coarse for [m], see ``solve_kernels.COARSE``, (t, v)."""
+    """What panels are too coarse for [m], see ``system_kernels.COARSE``, (t, v)."""
     t, v = wp.tid()
     if t >= cut.columns[v]:
         return
     total = float(0.0)
     for f in range(matrix.shape[0]):
-        if cut.number[f, v] >= 0 and cut.ends[f, v] > 0.0:
+        if cut.number[f, v] >= 0 and cut.panel_end_fraction[f, v] > 0.0:
             energy = wp.vec2()  # from its factor
             for k in range(f + 1):
                 entry = wp.vec2(matrix[f, k, v], 0.0)
@@ -67,20 +68,20 @@ def coarse(
             if cut.lossy[v] != 0:
                 imaginary = charge[f, charge.shape[1] // 2 + t, v]
                 square += imaginary * imaginary
-            total += _COARSE * cut.ends[f, v] * wp.length(energy) * square
+            total += _COARSE * cut.panel_end_fraction[f, v] * wp.length(energy) * square
     out[t, v] = total
 
 
 @wp.kernel
 def modes(
-    cut: WarpCut, lead: int, rows: wp.array3d(dtype=wp.float32),
+    cut: WarpActiveTree, phi_columns: int, rows: wp.array3d(dtype=wp.float32),
     charge: wp.array3d(dtype=wp.float32), added: int, out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Sums of ψ over all charges, (modes, 2 lead, v); ``added`` to what there is."""
     k, chunk, v = wp.tid()
     first = _COLUMNS * chunk
     start = rows.shape[1] - out.shape[0]
-    if start + k >= cut.width[v] or idle(cut, lead, first, v):
+    if start + k >= cut.width[v] or idle(cut, phi_columns, first, v):
         return
     total = some()
     if added != 0:
@@ -93,7 +94,7 @@ def modes(
 
 @wp.kernel
 def strengths(
-    green: Response, cut: WarpCut, sums: wp.array3d(dtype=wp.float32),
+    green: Response, cut: WarpActiveTree, sums: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Strength of the design's sources, a terminal at 1 V and charges in place, (s, 2 lead, v).
@@ -103,7 +104,7 @@ def strengths(
     batch, c, v = wp.tid()
     width = cut.width[v]
     near = _SOURCES * batch >= green.far
-    if (near and width < green.columns.shape[0]) or idle(cut, green.lead, c, v):
+    if (near and width < green.columns.shape[0]) or idle(cut, green.phi_columns, c, v):
         return
     total = many()
     if c < green.first:
@@ -116,12 +117,12 @@ def strengths(
 
 @wp.kernel
 def to_clusters(
-    cut: WarpCut, lead: int, charge: wp.array3d(dtype=wp.float32),
+    cut: WarpActiveTree, phi_columns: int, charge: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Charges of clusters from those of functions; these become those of the shapes' functions."""
     c, v = wp.tid()
-    if idle(cut, lead, c, v):
+    if idle(cut, phi_columns, c, v):
         return
     for step in range(cut.leader.shape[0]):
         b = cut.leader.shape[0] - 1 - step
@@ -156,9 +157,15 @@ def to_clusters(
 
 @wp.func
 def _fallen(
-    green: Response, cut: WarpCut, leaf: Leaf, body: int, charge: wp.array3d(dtype=wp.float32),
-    parts: int, first: int, v: int,
-):  # fmt: skip
+    green: Response,
+    cut: WarpActiveTree,
+    leaf: Leaf,
+    body: int,
+    charge: wp.array3d(dtype=wp.float32),
+    parts: int,
+    first: int,
+    v: int,
+):
     """How far charges lower the potentials on a leaf of a body, columns from ``first`` on.
 
     Those are on clusters, or on the ``parts`` of them. What charges of its own body do in free
@@ -179,7 +186,7 @@ def _fallen(
 
 @wp.func
 def _met(
-    green: Response, cut: WarpCut, leaf: Leaf, body: int, first: int, v: int,
+    green: Response, cut: WarpActiveTree, leaf: Leaf, body: int, first: int, v: int,
     left: Left,
 ):  # fmt: skip
     """Potentials on a leaf, but for its body's charges in free space."""
@@ -190,7 +197,7 @@ def _met(
 
 
 @wp.kernel
-def residuals(shapes: Shapes, places: Places, green: Response, cut: WarpCut, left: Left):
+def residuals(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree, left: Left):
     """Potentials that all charges leave in the function below each cluster, and its energy.
 
     Both are filled in ``left``; the energy [1/m] is zero where a cluster is a panel or there is
@@ -199,8 +206,8 @@ def residuals(shapes: Shapes, places: Places, green: Response, cut: WarpCut, lef
     i, chunk, v = wp.tid()
     k = cut.node[i, v]
     first = _COLUMNS * chunk
-    imaginary = first >= green.lead
-    if idle(cut, green.lead, first, v):
+    imaginary = first >= green.phi_columns
+    if idle(cut, green.phi_columns, first, v):
         return
     b = i // cut.clusters
     e = v // places.hidden.shape[0]
@@ -212,12 +219,16 @@ def residuals(shapes: Shapes, places: Places, green: Response, cut: WarpCut, lef
     leaf = leaf_of(cut, part, v)
     out = _met(green, cut, leaf, b, first, v, left)
     whole = own(shapes, places, e, b, x, x)
-    whole[0] += _BARRIER * leaf.beyond * leaf.beyond * leaf.beyond
+    whole[0] += (
+        _WALL_PENALTY * leaf.outside_fraction * leaf.outside_fraction * leaf.outside_fraction
+    )
     leaf = leaf_of(cut, part + 1, v)
     out -= _met(green, cut, leaf, b, first, v, left)
-    whole[0] += _BARRIER * leaf.beyond * leaf.beyond * leaf.beyond
+    whole[0] += (
+        _WALL_PENALTY * leaf.outside_fraction * leaf.outside_fraction * leaf.outside_fraction
+    )
     o = b * cut.clusters
-    other = wp.where(imaginary, first - green.lead, first + green.lead)
+    other = wp.where(imaginary, first - green.phi_columns, first + green.phi_columns)
     for j in range(cut.clusters):
         y = wp.where(j == 0, 0, cut.number[o + j, v])
         if y >= 0:
@@ -232,7 +243,7 @@ def residuals(shapes: Shapes, places: Places, green: Response, cut: WarpCut, lef
 
 
 @wp.kernel
-def estimated(cut: WarpCut, left: Left, out: wp.array3d(dtype=wp.float32)):
+def estimated(cut: WarpActiveTree, left: Left, out: wp.array3d(dtype=wp.float32)):
     """Charges on the parts of clusters that belong to the estimate, in the rows behind those of
     the clusters, (l, lead, v)."""
     i, c, v = wp.tid()
@@ -247,7 +258,7 @@ def estimated(cut: WarpCut, left: Left, out: wp.array3d(dtype=wp.float32)):
 
 @wp.kernel
 def felt(
-    green: Response, cut: WarpCut, charge: wp.array3d(dtype=wp.float32),
+    green: Response, cut: WarpActiveTree, charge: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Potentials at the design's sources by charges on parts of clusters, (s, lead, v)."""
@@ -265,7 +276,7 @@ def felt(
 
 @wp.kernel
 def answered(
-    green: Response, cut: WarpCut, potential: wp.array3d(dtype=wp.float32),
+    green: Response, cut: WarpActiveTree, potential: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Sums of ψ over charges from their potentials at the sources, (modes, lead, v)."""
@@ -283,7 +294,7 @@ def answered(
 
 @wp.kernel
 def energies_below(
-    shapes: Shapes, places: Places, cut: WarpCut,
+    shapes: Shapes, places: Places, cut: WarpActiveTree,
     charge: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Less the energies of the shapes' functions with charges on parts, (n, lead, v)."""
@@ -305,7 +316,7 @@ def energies_below(
 
 @wp.kernel
 def pairs_below(
-    green: Response, cut: WarpCut, charge: wp.array3d(dtype=wp.float32),
+    green: Response, cut: WarpActiveTree, charge: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Add how far charges on parts of clusters lower the potentials on clusters, (n, lead, v)."""
@@ -320,7 +331,7 @@ def pairs_below(
 
 @wp.kernel
 def modes_below(
-    cut: WarpCut, rows: wp.array3d(dtype=wp.float32), sums: wp.array3d(dtype=wp.float32),
+    cut: WarpActiveTree, rows: wp.array3d(dtype=wp.float32), sums: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Add the potentials in functions by the design, from sums of ψ over charges, (n, lead, v)."""

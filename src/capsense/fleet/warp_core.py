@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
 from capsense.field.soft import BODY
@@ -23,8 +22,9 @@ from capsense.fleet.warp_chips import WarpChips
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
 from capsense.readout import Readout
-from capsense.surface.solver import SurfaceSolver
-from capsense.surface.touch_kernels import COARSE, FINE
+from capsense.solver.gap.touch_kernels import COARSE, FINE
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.tree.rigid import RigidShape
 
 Array = NDArray[np.float64]
 
@@ -62,34 +62,57 @@ class WarpCore:
         self.gap = warp_near.pack_gap(solver.green, table, slots, device)
         self.outlines: Any = None
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
-        passes, t, lead = self.green.table.shape[1], self.green.terminals, self.green.lead
+        passes, t, phi_columns = (
+            self.green.table.shape[1],
+            self.green.terminals,
+            self.green.phi_columns,
+        )
         size, chunks = t + slots, len(self.gap.owner)
         width, room, struct = passes * warp_cut.WIDTH, self.room, self._struct
-        self.cut = struct(warp_cut.WarpCut, {
-            "split number score part mix weight ends out": (n, views),
-            "node lifted extent soft beyond near points unlifted": (3 * n, views),
-            "pose moved leader tie slot": (places, views),
-            "lossy width walled columns": (views,),
-        })  # fmt: skip
+        self.cut = struct(
+            warp_cut.WarpActiveTree,
+            {
+                "split number score part mix weight panel_end_fraction out": (n, views),
+                "node lifted extent softening_length outside_fraction near points unlifted": (
+                    3 * n,
+                    views,
+                ),
+                "pose moved leader ground_elastance slot": (places, views),
+                "lossy width walled columns": (views,),
+            },
+        )
         self.cut.clusters = clusters
-        self.left = struct(solution.Left, {
-            "charge on residual": (n, 2 * lead, views),
-            "sums": (width - self.green.first, 2 * lead, views),
-            "strength": (len(self.green.sources), 2 * lead, views),
-            "energy": (n, views), "doubt": (size, views), "dropped": (views,),
-            "below": (size, size, views), "volts": (slots, t, views),
-        })  # fmt: skip
+        self.left = struct(
+            solution.Left,
+            {
+                "charge on residual": (n, 2 * phi_columns, views),
+                "sums": (width - self.green.first, 2 * phi_columns, views),
+                "strength": (len(self.green.sources), 2 * phi_columns, views),
+                "potential_coefficients": (n, views),
+                "doubt": (size, views),
+                "dropped": (views,),
+                "below": (size, size, views),
+                "volts": (slots, t, views),
+            },
+        )
         self.near = struct(warp_near.NearBodies, {
             "count": (views,), "body below sunk foot": (places, views),
             "depth": (chunks, places, views),
             "capacitance": (slots, views),
             "part": (chunks, table.columns.shape[1] + slots, views),
         })  # fmt: skip
-        self.places = struct(warp_cut.Places, {
-            "choice neutral softness tie scale slack": (environments, places),
-            "hidden": (sensors, places), "group": (places,),
-        })  # fmt: skip
-        for name in ("scale", "softness", "group"):
+        self.places = struct(
+            warp_cut.Places,
+            {
+                "choice neutral inverse_susceptibility ground_elastance scale slack": (
+                    environments,
+                    places,
+                ),
+                "hidden": (sensors, places),
+                "group": (places,),
+            },
+        )
+        for name in ("scale", "inverse_susceptibility", "group"):
             setattr(self.near, name, getattr(self.places, name))
         for name in ("pose", "slot", "columns", "lossy"):
             setattr(self.near, name, getattr(self.cut, name))
@@ -161,10 +184,10 @@ class WarpCore:
         if len(bodies.shapes) != self._taken:
             if self._captured:
                 self._captured = False
-                before = self.places.choice, self.circuit.rest, self.circuit.empty
+                before = self.places.choice, self.circuit.empty_maxwell, self.circuit.empty
                 self._before.append((self.shapes, self.outlines, *before))
                 self.places.choice = wp.clone(before[0])
-                self.circuit.rest, self.circuit.empty = map(wp.clone, before[1:])
+                self.circuit.empty_maxwell, self.circuit.empty = map(wp.clone, before[1:])
                 for matrix in before[1:]:
                     matrix.fill_(np.nan)
             self.shapes, self._taken = pack_shapes(shapes, bodies, self._array), len(bodies.shapes)
@@ -174,7 +197,7 @@ class WarpCore:
             getattr(self.places, name).assign(getattr(bodies, name).astype(np.int32))
         for name in ("scale", "slack"):
             getattr(self.places, name).assign(getattr(bodies, name).astype(np.float32))
-        for name in ("softness", "tie"):
+        for name in ("inverse_susceptibility", "ground_elastance"):
             both = getattr(bodies, name).astype(np.complex64).view(np.float32)
             getattr(self.places, name).assign(both.reshape(*bodies.scale.shape, 2))
         self.own_forces.assign(forces.astype(np.float32))
@@ -277,17 +300,21 @@ class WarpCore:
     def _look_below(self) -> None:
         """Charges, and the potentials that they leave in functions that are not solved for."""
         cut, green, rest, rows = self.cut, self.green, self.left, self.rows
-        (n, columns, views), lead, t = rest.charge.shape, green.lead, self.whole.shape[0]
+        (n, columns, views), phi_columns, t = (
+            rest.charge.shape,
+            green.phi_columns,
+            self.whole.shape[0],
+        )
         launch, matrix, loss = self.launch, self.matrix, self.loss
         parts, batches = columns // pairs.COLUMNS, green.columns.shape[1]
         solved = matrix, loss, self.solved, self.quadrature
-        launch(solution.charges, (t, views), cut, lead, *solved, rest.charge)
+        launch(solution.charges, (t, views), cut, phi_columns, *solved, rest.charge)
         launch(charges.coarse, (t, views), cut, matrix, loss, rest.charge, rest.doubt)
         size = rest.sums.shape[0], parts, views
-        launch(charges.modes, size, cut, lead, rows, rest.charge, 0, rest.sums)
+        launch(charges.modes, size, cut, phi_columns, rows, rest.charge, 0, rest.sums)
         size = batches, columns, views
         launch(charges.strengths, size, green, cut, rest.sums, rest.strength)
-        launch(charges.to_clusters, (columns, views), cut, lead, rest.charge, rest.on)
+        launch(charges.to_clusters, (columns, views), cut, phi_columns, rest.charge, rest.on)
         at = self.shapes, self.places
         launch(charges.residuals, (n, parts, views), *at, green, cut, rest)
 
@@ -296,37 +323,44 @@ class WarpCore:
         environments, places, sensors = self.counts
         n, views = self.cut.number.shape
         circuit, green, cut, rest = self.circuit, self.green, self.cut, self.left
-        m, t, lead, room = circuit.electrodes, self.whole.shape[0], green.lead, self.room
+        m, t, phi_columns, room = (
+            circuit.electrodes,
+            self.whole.shape[0],
+            green.phi_columns,
+            self.room,
+        )
         sources, modes = len(green.sources), rest.sums.shape[0]
         gap, near, chunks = self.gap, self.near, len(self.gap.owner)
         if self._slopes is None:
             self._slopes = [
-                *(room(rows, lead, views) for rows in (3 * n, n, sources, modes)),
+                *(room(rows, phi_columns, views) for rows in (3 * n, n, sources, modes)),
                 room(views, places, m, m, dtype=wp.spatial_vector),
                 self._struct(warp_slope.Slopes, {
-                    "volts": (t, m, views), "charge pull": (3 * n, lead, views),
+                    "volts": (t, m, views), "charge pull": (3 * n, phi_columns, views),
                     "lift": (places, views),
                     "part sink": (chunks, self.gap.columns.shape[1] + 1, places, views),
                 }),
             ]  # fmt: skip
             self._slopes[-1].charge = self._slopes[0]
         charge, back, strength, sums, out, slopes = self._slopes
-        launch, parts, at = self.launch, lead // pairs.COLUMNS, (self.shapes, self.places)
-        launch(charges.estimated, (n, lead, views), cut, rest, charge)
+        launch, parts, at = self.launch, phi_columns // pairs.COLUMNS, (self.shapes, self.places)
+        launch(charges.estimated, (n, phi_columns, views), cut, rest, charge)
         launch(charges.felt, (sources, parts, views), green, cut, charge, strength)
         launch(charges.answered, (modes, parts, views), green, cut, strength, sums)
         launch(charges.energies_below, (n, parts, views), *at, cut, charge, back)
-        launch(solution.from_functions, (lead, views), cut, 0, back)
+        launch(solution.from_functions, (phi_columns, views), cut, 0, back)
         launch(charges.pairs_below, (n, parts, views), green, cut, charge, back)
-        launch(solution.to_functions, (lead, views), cut, 0, back)
+        launch(solution.to_functions, (phi_columns, views), cut, 0, back)
         launch(charges.modes_below, (n, parts, views), cut, self.rows, sums, back)
         solved = self.matrix, self.loss, back, self.quadrature
         launch(solution.forward, (t, views), cut, t, back, *solved)
         launch(charges.add, (n, t, views), self.solved, back)
-        launch(solution.charges, (t, views), cut, lead, *solved, rest.charge)
-        launch(charges.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, 1, sums)
-        launch(charges.to_clusters, (lead, views), cut, lead, rest.charge, charge)
-        size = green.columns.shape[1], lead, views
+        launch(solution.charges, (t, views), cut, phi_columns, *solved, rest.charge)
+        launch(
+            charges.modes, (modes, parts, views), cut, phi_columns, self.rows, rest.charge, 1, sums
+        )
+        launch(charges.to_clusters, (phi_columns, views), cut, phi_columns, rest.charge, charge)
+        size = green.columns.shape[1], phi_columns, views
         launch(charges.strengths, size, green, cut, sums, strength)
         launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, slopes.pull)
         launch(network.follow, (m, views), circuit, cut, self.whole, slopes.volts)

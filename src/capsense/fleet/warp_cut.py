@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.field.green_kernels import DEEP, SHORE, STEEP
-from capsense.surface.look_kernels import LONG
-from capsense.surface.pair_kernels import BARRIER, LIFTED
+from capsense.field.face_kernels import DEEP, STEEP, WALL_FADE_LENGTH
+from capsense.solver.interaction.pair_kernels import LIFTED, WALL_PENALTY
+from capsense.solver.selection.evaluation_kernels import LONG
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -33,9 +33,9 @@ _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
 _CROSSING = wp.constant(2.0)
 _LONG0, _LONG1 = (wp.constant(x) for x in LONG)
-_LIFTED, _BARRIER = wp.constant(LIFTED), wp.constant(BARRIER)
+_LIFTED, _WALL_PENALTY = wp.constant(LIFTED), wp.constant(WALL_PENALTY)
 _DEEP, _BEHIND = wp.constant(DEEP[0]), wp.constant(DEEP[1])
-_STEEP, _SHORE = wp.constant(STEEP), wp.constant(SHORE)
+_STEEP, _WALL_FADE_LENGTH = wp.constant(STEEP), wp.constant(WALL_FADE_LENGTH)
 
 
 @wp.struct
@@ -46,15 +46,15 @@ class Shapes:
     functions: wp.array(dtype=wp.int32)  # how many functions have energies
     block: wp.array(dtype=wp.int64)  # where its energies begin
     radius: wp.array(dtype=wp.float32)
-    kids: wp.array2d(dtype=wp.int32)  # parts of a cluster, from 0 within the shape; -1 for none
+    children: wp.array2d(dtype=wp.int32)  # parts of a cluster, from 0 within the shape; -1 for none
     function: wp.array(dtype=wp.int32)
     charge: wp.array(dtype=wp.float32)
     center: wp.array(dtype=wp.vec3)
     points: wp.array2d(dtype=wp.vec3)
     extent: wp.array(dtype=wp.float32)
-    soft: wp.array(dtype=wp.float32)
-    energy: wp.array(dtype=wp.float32)
-    impedance: wp.array(dtype=wp.float32)
+    softening_length: wp.array(dtype=wp.float32)
+    potential_coefficients: wp.array(dtype=wp.float32)
+    neumann_to_dirichlet: wp.array(dtype=wp.float32)
 
 
 @wp.struct
@@ -63,8 +63,8 @@ class Places:
 
     choice: wp.array2d(dtype=wp.int32)
     scale: wp.array2d(dtype=wp.float32)
-    softness: wp.array2d(dtype=wp.vec2)  # complex, as ties are
-    tie: wp.array2d(dtype=wp.vec2)
+    inverse_susceptibility: wp.array2d(dtype=wp.vec2)  # complex, as ties are
+    ground_elastance: wp.array2d(dtype=wp.vec2)
     neutral: wp.array2d(dtype=wp.int32)
     slack: wp.array2d(dtype=wp.vec3)  # half of what is cut off along each axis
     group: wp.array(dtype=wp.int32)  # joined places have the same number, (b,)
@@ -81,10 +81,10 @@ class Response:
     far: wp.int32  # how many are far ones
     passes: wp.int32  # that these have
     first: wp.int32  # column of the first ψ in these
-    lead: wp.int32  # columns of charges: of terminals, then of nodes
+    phi_columns: wp.int32  # columns of charges: of terminals, then of nodes
     terminals: wp.int32
     floor: wp.float32
-    cover: wp.float32
+    has_face: wp.int32
     extent: wp.float32  # shortest side of the domain
     validity: wp.float32  # distance from which the Green's function is valid
     blend0: wp.float32
@@ -98,7 +98,7 @@ class Response:
 
 
 @wp.struct
-class WarpCut:
+class WarpActiveTree:
     """Clusters and functions of every view, K for each place; n = b K.
 
     Leaves are the clusters and, behind all of them, the two parts of each, l = 3 n.
@@ -115,17 +115,21 @@ class WarpCut:
     weight: wp.array2d(dtype=wp.float32)
     walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
-    ends: wp.array2d(dtype=wp.float32)  # which part of its two parts are panels, (n, v)
+    panel_end_fraction: wp.array2d(
+        dtype=wp.float32
+    )  # which part of its two parts are panels, (n, v)
     out: wp.array2d(dtype=wp.float32)  # how far a cluster's leaves are out of reach, (n, v)
     points: wp.array2d(dtype=four)  # of the leaves, (l, v)
     unlifted: wp.array2d(dtype=four)  # the same before they were lifted off the design
     lifted: wp.array2d(dtype=wp.int32)  # whether they were, (l, v)
     extent: wp.array2d(dtype=wp.float32)
-    soft: wp.array2d(dtype=wp.float32)  # distance below which 1/r is bounded [m]
-    beyond: wp.array2d(dtype=wp.float32)
+    softening_length: wp.array2d(dtype=wp.float32)  # distance below which 1/r is bounded [m]
+    outside_fraction: wp.array2d(dtype=wp.float32)
     near: wp.array2d(dtype=wp.float32)  # share of the near sources, (l, v)
     leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
-    tie: wp.array2d(dtype=wp.vec2)  # energy of the net charge of the leader and all others, (b, v)
+    ground_elastance: wp.array2d(
+        dtype=wp.vec2
+    )  # energy of the net charge of the leader and all others, (b, v)
     slot: wp.array2d(dtype=wp.int32)  # number of the node that a body is part of, else -1, (b, v)
     columns: wp.array(dtype=wp.int32)  # terminals and nodes, (v,)
     lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
@@ -163,7 +167,7 @@ def _need(
 
     Where it crosses a wall, ``_CROSSING`` times its share of the body's length is added.
     """
-    if shapes.kids[node, 0] < 0:
+    if shapes.children[node, 0] < 0:
         return float(0.0)
     size = scale * shapes.extent[node]
     p = wp.transform_point(at, scale * shapes.center[node])
@@ -178,17 +182,17 @@ def _need(
 
 
 @wp.func
-def idle(cut: WarpCut, lead: int, first: int, v: int):
+def idle(cut: WarpActiveTree, phi_columns: int, first: int, v: int):
     """Whether no column from this one on means something in a view."""
-    imaginary = first >= lead
-    at = wp.where(imaginary, first - lead, first)
+    imaginary = first >= phi_columns
+    at = wp.where(imaginary, first - phi_columns, first)
     return at >= cut.columns[v] or (imaginary and cut.lossy[v] == 0)
 
 
 @wp.kernel
 def stand(
     shapes: Shapes, places: Places, green: Response, bodies: wp.array2d(dtype=wp.transform),
-    sensors: wp.array2d(dtype=wp.transform), cut: WarpCut,
+    sensors: wp.array2d(dtype=wp.transform), cut: WarpActiveTree,
 ):  # fmt: skip
     """Where bodies stand in the sensors' frames, and which of them a sensor sees."""
     b, v = wp.tid()
@@ -214,13 +218,16 @@ def stand(
     cut.moved[b, v] = moved
     scale = places.scale[e, b]
     away = _off(wp.transform_get_translation(at), green.room0, green.room1)
-    if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u] + _SHORE * green.extent:
+    if (
+        wp.max(away[0], wp.max(away[1], away[2]))
+        > scale * shapes.radius[u] + _WALL_FADE_LENGTH * green.extent
+    ):
         return
     cut.node[o, v] = shapes.first[u]
 
 
 @wp.kernel
-def choose(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
+def choose(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     """Cut every body that a sensor sees into clusters."""
     b, v = wp.tid()
     e = v // places.hidden.shape[0]
@@ -228,7 +235,7 @@ def choose(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
     for j in range(1, cut.clusters):
         cut.node[o + j, v] = -1
         cut.number[o + j, v] = -1
-    cut.ends[o, v] = 0.0
+    cut.panel_end_fraction[o, v] = 0.0
     first = cut.node[o, v]
     if first < 0:
         return
@@ -244,14 +251,14 @@ def choose(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
                 best = i
         if most > 0.0:
             k = cut.node[o + best, v]
-            x = first + shapes.kids[k, 0]
-            y = first + shapes.kids[k, 1]
+            x = first + shapes.children[k, 0]
+            y = first + shapes.children[k, 1]
             cut.split[o + j, v] = best
             cut.part[o + j, v] = shapes.charge[x] / shapes.charge[k]
             cut.number[o + j, v] = shapes.function[k]
-            cut.ends[o + j, v] = wp.where(shapes.kids[x, 0] < 0, 0.5, 0.0) + wp.where(
-                shapes.kids[y, 0] < 0, 0.5, 0.0
-            )
+            cut.panel_end_fraction[o + j, v] = wp.where(
+                shapes.children[x, 0] < 0, 0.5, 0.0
+            ) + wp.where(shapes.children[y, 0] < 0, 0.5, 0.0)
             cut.node[o + best, v] = x
             cut.node[o + j, v] = y
             cut.score[o + best, v] = _need(shapes, green, at, scale, first, x)
@@ -262,7 +269,7 @@ def choose(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
 
 @wp.func
 def held_off(distance: float, length: float):
-    """A distance that becomes ``length`` in contact, as ``green_kernels.held_off``."""
+    """A distance that becomes ``length`` in contact, as ``face_kernels.held_off``."""
     if distance >= 2.0 * length:
         return distance
     return length + distance * distance / (4.0 * length)
@@ -270,7 +277,7 @@ def held_off(distance: float, length: float):
 
 @wp.func
 def lift(p: wp.vec3, gap: float, green: Response):
-    """Keep a point off a flat design, as ``green_kernels.lift``."""
+    """Keep a point off a flat design, as ``face_kernels.lift``."""
     away = _off(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
     way = wp.length(away)
     if way >= 2.0 * gap:
@@ -322,7 +329,7 @@ def lift_back(force: wp.vec3, p: wp.vec3, gap: float, green: Response):
 
 
 @wp.kernel
-def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
+def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     """Place all leaves in the sensor frame, and find where they stand to design and walls."""
     i, v = wp.tid()
     n = cut.number.shape[0]
@@ -335,7 +342,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
         b = (i - n) // (2 * cut.clusters)
         whole = cut.node[(i - n) // 2, v]
         if whole >= 0:
-            k = shapes.kids[whole, (i - n) % 2]
+            k = shapes.children[whole, (i - n) % 2]
             if k >= 0:
                 k += shapes.first[places.choice[e, b]]
         cut.node[i, v] = k
@@ -351,7 +358,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
     off = wp.length(_off(c, green.room0, green.room1))
     lifted = int(0)
     deep = float(0.0)
-    if green.cover < 1.0:
+    if green.has_face != 0:
         depth = wp.min(1.0, green.box1[2] - c[2])
         for d in range(2):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
@@ -365,14 +372,14 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
     cut.points[i, v] = points
     cut.lifted[i, v] = lifted
     cut.extent[i, v] = size
-    cut.soft[i, v] = scale * shapes.soft[k]
-    cut.beyond[i, v] = smooth(wp.max(off / (_SHORE * green.extent), deep))
+    cut.softening_length[i, v] = scale * shapes.softening_length[k]
+    cut.outside_fraction[i, v] = smooth(wp.max(off / (_WALL_FADE_LENGTH * green.extent), deep))
     away = wp.length(_off(0.5 * (points[0] + points[3]), green.box0, green.box1))
     cut.near[i, v] = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
 
 
 @wp.kernel
-def weigh(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
+def weigh(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     """How many columns a view needs, and how its functions share charge among their parts.
 
     Fewer columns do where no cluster is near the design. Where clusters are out of reach, functions
@@ -388,10 +395,10 @@ def weigh(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
         if k >= 0:
             if cut.near[i, v] > 0.0:
                 passes = green.table.shape[1]
-            x = cut.beyond[i, v]
+            x = cut.outside_fraction[i, v]
             cut.out[i, v] = x
             walled = wp.where(x > 0.0 and cut.lossy[v] == 0, 1, walled)
-            stiff = _BARRIER * x * x * x * cut.extent[i, v]
+            stiff = _WALL_PENALTY * x * x * x * cut.extent[i, v]
             cut.weight[i, v] = shapes.charge[k] / (1.0 + stiff)
     cut.width[v] = _WIDTH * passes
     cut.walled[v] = walled
@@ -404,7 +411,7 @@ def weigh(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
                 cut.mix[j, v] = cut.part[j, v]
                 cut.out[i, v] = wp.max(cut.out[i, v], cut.out[j, v])
                 if cut.out[i, v] > 0.0:  # see choose_kernels.functions_of
-                    cut.ends[j, v] = 0.0
+                    cut.panel_end_fraction[j, v] = 0.0
                 if walled != 0:
                     whole = cut.weight[i, v] + cut.weight[j, v]
                     cut.mix[j, v] = cut.weight[i, v] / whole

@@ -1,7 +1,7 @@
 """Conducting fabrics on the covers of many environments, as Warp kernels; 4π eps0 = 1.
 
-The twin of these kernels is ``fabric_change`` of :mod:`capsense.surface.gap_kernels`. Lengths are
-over the solver's ``length``.
+The twin of these kernels is ``fabric_change`` of :mod:`capsense.solver.gap.gap_kernels`. Lengths
+are over the solver's ``length``.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def find_touching(
 ):  # fmt: skip
     """Enter the bodies, of whatever matter, that reach below the face, (b, v).
 
-    ``node`` and ``clusters`` are of ``WarpCut``, which would be more than a GPU takes.
+    ``node`` and ``clusters`` are of ``WarpActiveTree``, which would be more than a GPU takes.
     """
     b, v = wp.tid()
     e = v // near.sensors

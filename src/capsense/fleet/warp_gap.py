@@ -1,6 +1,6 @@
 """The gap law of many environments as Warp kernels: what bodies near a flat design add.
 
-The twin of these kernels is :mod:`capsense.surface.gap_kernels`; what they work with is told in
+The twin of these kernels is :mod:`capsense.solver.gap.gap_kernels`; what they work with is told in
 :mod:`capsense.fleet.warp_near`. Lengths in metres, 4π eps0 = 1.
 """
 
@@ -13,7 +13,7 @@ import warp as wp
 from capsense.fleet.warp_cut import Response, held_off, lift, smooth
 from capsense.fleet.warp_mesh import Hit, Outlines
 from capsense.fleet.warp_near import GapLaw, NearBodies, may_meet, nearest_of
-from capsense.surface.gap_kernels import REACH
+from capsense.solver.gap.gap_kernels import REACH
 
 wp.set_module_options({"enable_backward": False})
 

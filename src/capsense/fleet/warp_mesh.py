@@ -1,6 +1,6 @@
 """Triangle meshes as the Warp kernels take them: nearest points, by a tree of boxes.
 
-The twin of these functions is :mod:`capsense.elements.outline`, whose trees they take.
+The twin of these functions is :mod:`capsense.solver.bodies.outline`, whose trees they take.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What is near a flat design in many environments, as Warp kernels; 4π eps0 = 1.
 
 The twins of these kernels are ``near_bodies`` and ``press_out`` of
-:mod:`capsense.surface.gap_kernels`, and ``network_kernels.as_nodes``. A design's cells stand in
+:mod:`capsense.solver.gap.gap_kernels`, and ``network_kernels.as_nodes``. A design's cells stand in
 blocks, and a few blocks of one terminal are a *chunk*, which a thread works out for one view. Sums
 of chunks are added in a fixed order. Lengths in metres.
 """
@@ -13,17 +13,21 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from capsense.elements.matter import SHUT
 from capsense.field.green_kernels import Gap, Green, no_gap
 from capsense.field.soft import BODY
-from capsense.fleet.warp_cut import Places, WarpCut
+from capsense.fleet.warp_cut import Places, WarpActiveTree
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import farthest_point, middle_height, nearest, reach_down
-from capsense.surface.gap_kernels import EXACT, WAYS
+from capsense.solver.gap.gap_kernels import EXACT, WAYS
+from capsense.solver.tree.matter import FLOATING_PENALTY
 
 wp.set_module_options({"enable_backward": False})
 
-_WAYS, _EXACT, _SHUT = wp.constant(WAYS), wp.constant(EXACT), wp.constant(SHUT)
+_WAYS, _EXACT, _FLOATING_PENALTY = (
+    wp.constant(WAYS),
+    wp.constant(EXACT),
+    wp.constant(FLOATING_PENALTY),
+)
 _BLOCKS = 3
 """About so many blocks are a chunk."""
 
@@ -64,14 +68,14 @@ class GapLaw:
 class NearBodies:
     """What is near the design in every view; b places for bodies.
 
-    The first ones are arrays of ``Places``, ``Shapes`` and ``WarpCut``: kernels that took all of
-    these would have more arguments than a GPU takes.
+    The first ones are arrays of ``Places``, ``Shapes`` and ``WarpActiveTree``: kernels that took
+    all of these would have more arguments than a GPU takes.
     """
 
     sensors: wp.int32  # in each environment
     choice: wp.array2d(dtype=wp.int32)
     scale: wp.array2d(dtype=wp.float32)
-    softness: wp.array2d(dtype=wp.vec2)
+    inverse_susceptibility: wp.array2d(dtype=wp.vec2)
     group: wp.array(dtype=wp.int32)
     radius: wp.array(dtype=wp.float32)
     pose: wp.array2d(dtype=wp.transform)
@@ -98,7 +102,7 @@ def pack_gap(green: Green, gap: Gap, slots: int, device: Any) -> GapLaw:
     """Lay the gap law of a design out for the kernels."""
     terminals = green.terminals
     out, cells = GapLaw(), len(gap.areas)
-    out.floor, out.ceiling = float(green.room[0, 2]), float(green.room[1, 2])
+    out.floor, out.ceiling = float(green.active_bounds[0, 2]), float(green.active_bounds[1, 2])
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
     out.least = gap.least
@@ -124,7 +128,7 @@ def pack_gap(green: Green, gap: Gap, slots: int, device: Any) -> GapLaw:
 
 
 @wp.kernel
-def connect(places: Places, cut: WarpCut, terminals: int):
+def connect(places: Places, cut: WarpActiveTree, terminals: int):
     """What ties the bodies of a view to ground; places that are joined are one conductor.
 
     Those that are out of sight count for the tie. The leader of those in sight has the function of
@@ -137,7 +141,7 @@ def connect(places: Places, cut: WarpCut, terminals: int):
     for b in range(places.group.shape[0]):
         o = b * cut.clusters
         leader = int(b)
-        tie = places.tie[e, b]
+        tie = places.ground_elastance[e, b]
         neutral = places.neutral[e, b]
         if cut.node[o, v] >= 0:
             others = int(0)
@@ -150,25 +154,25 @@ def connect(places: Places, cut: WarpCut, terminals: int):
                         others = wp.where(c == b, others, 1)
                     if places.neutral[e, c] == 0:  # those out of sight count too
                         others = wp.where(c == b, others, 1)
-                        if places.tie[e, c][0] == 0.0:
+                        if places.ground_elastance[e, c][0] == 0.0:
                             grounded = 1
                         else:
-                            ground += 1.0 / places.tie[e, c][0]
+                            ground += 1.0 / places.ground_elastance[e, c][0]
             if others == 1:
                 neutral = wp.where(grounded == 0 and ground == 0.0, 1, 0)
                 tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
             cut.number[o, v] = wp.where(leader == b and neutral != 0, -1, 0)
-            if tie[1] != 0.0 or places.softness[e, b][1] != 0.0:
+            if tie[1] != 0.0 or places.inverse_susceptibility[e, b][1] != 0.0:
                 lossy = 1
         cut.leader[b, v] = leader
-        cut.tie[b, v] = tie
+        cut.ground_elastance[b, v] = tie
         cut.slot[b, v] = -1
     cut.lossy[v] = lossy
     cut.columns[v] = terminals
 
 
 @wp.kernel
-def find_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies):
+def find_near(outlines: Outlines, gap: GapLaw, cut: WarpActiveTree, near: NearBodies):
     """Enter the bodies that are near, and make nodes of those that are not at ground.
 
     Of places that are joined, all become one node, and are their own leaders, at ground or at 1 V.
@@ -181,7 +185,7 @@ def find_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies):
         for b in range(near.group.shape[0]):
             there = _is_near(outlines, gap, cut, near, b, v)
             neutral = cut.number[cut.leader[b, v] * cut.clusters, v] < 0
-            if there and cut.slot[b, v] < 0 and (neutral or cut.tie[b, v][0] > 0.0):
+            if there and cut.slot[b, v] < 0 and (neutral or cut.ground_elastance[b, v][0] > 0.0):
                 there = nodes < gap.slots
                 if there:
                     _make_node(cut, near, b, neutral, nodes, v)
@@ -194,11 +198,11 @@ def find_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies):
 
 
 @wp.func
-def _make_node(cut: WarpCut, near: NearBodies, b: int, neutral: bool, slot: int, v: int):
+def _make_node(cut: WarpActiveTree, near: NearBodies, b: int, neutral: bool, slot: int, v: int):
     """Make a node of a place and of those that it is joined with."""
-    tie = cut.tie[b, v][0]
+    tie = cut.ground_elastance[b, v][0]
     own = float(0.0)
-    if not neutral and tie < 0.5 * _SHUT:
+    if not neutral and tie < 0.5 * _FLOATING_PENALTY:
         own = 1.0 / tie
     near.capacitance[slot, v] = own
     for c in range(near.group.shape[0]):
@@ -206,15 +210,17 @@ def _make_node(cut: WarpCut, near: NearBodies, b: int, neutral: bool, slot: int,
             cut.slot[c, v] = slot
             cut.leader[c, v] = c
             cut.number[c * cut.clusters, v] = 0
-            cut.tie[c, v] = wp.vec2()
+            cut.ground_elastance[c, v] = wp.vec2()
 
 
 @wp.func
-def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b: int, v: int):
+def _is_near(
+    outlines: Outlines, gap: GapLaw, cut: WarpActiveTree, near: NearBodies, b: int, v: int
+):
     """Whether a conductor is within twice h0 of the face, as ``gap_kernels.near_bodies``."""
     e = v // near.sensors
     out = bool(False)
-    if cut.node[b * cut.clusters, v] >= 0 and near.softness[e, b][0] == 0.0:
+    if cut.node[b * cut.clusters, v] >= 0 and near.inverse_susceptibility[e, b][0] == 0.0:
         u = near.choice[e, b]
         at = near.pose[b, v]
         scale = near.scale[e, b]

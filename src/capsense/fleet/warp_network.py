@@ -1,22 +1,23 @@
 """The step of many environments as Warp kernels: from solutions to the matrices of electrodes.
 
 Conductors near the design that are not at ground are nodes of a network, as
-:mod:`capsense.surface.network_kernels` has them: their columns follow those of the terminals, and
-they are eliminated from the matrix of both. Lengths in metres, 4π eps0 = 1, unless units say else.
+:mod:`capsense.solver.system.network_kernels` has them: their columns follow those of the terminals,
+and they are eliminated from the matrix of both. Lengths in metres, 4π eps0 = 1, unless units say
+else.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from capsense.fleet.warp_cut import WarpCut
+from capsense.fleet.warp_cut import WarpActiveTree
 from capsense.fleet.warp_gap import local_of
 from capsense.fleet.warp_near import GapLaw, NearBodies
 from capsense.fleet.warp_pairs import body_of
 from capsense.fleet.warp_slope import Slopes
 from capsense.fleet.warp_solve import Left, over, times
-from capsense.surface.solve_kernels import GAIN
-from capsense.surface.step import FIELD_ERROR
+from capsense.solver.system.step import FIELD_ERROR
+from capsense.solver.system.system_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -32,7 +33,7 @@ class Circuit:
     unit: wp.float32  # capacitance that kernels take for one [F]
     metre: wp.float32  # the same of a metre: 4π eps0 [F]
     omega: wp.float32  # angular frequency [rad/s]
-    rest: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
+    empty_maxwell: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
     empty: wp.array2d(dtype=wp.float64)  # that of the driven ones, the others eliminated, (k, k)
     screened: wp.array2d(dtype=wp.float32)  # bound of what an entry changes by [F], (t, t)
 
@@ -48,7 +49,7 @@ def change(
         return
     total = wp.vec2()
     more = wp.vec2()
-    lead = left.residual.shape[1] // 2
+    phi_columns = left.residual.shape[1] // 2
     for f in range(potentials.shape[0]):
         total += times(
             wp.vec2(potentials[f, i, v], quadrature[f, i, v]),
@@ -59,8 +60,8 @@ def change(
             x = wp.vec2(left.residual[f, i, v], 0.0)
             y = wp.vec2(left.residual[f, j, v], 0.0)
             if near.lossy[v] != 0:
-                x[1] = left.residual[f, lead + i, v]
-                y[1] = left.residual[f, lead + j, v]
+                x[1] = left.residual[f, phi_columns + i, v]
+                y[1] = left.residual[f, phi_columns + j, v]
             more += _GAIN * over(times(x, y), own)
     total += more
     left.below[i, j, v] = more[0]
@@ -95,7 +96,7 @@ def eliminate(circuit: Circuit, near: NearBodies, left: Left, whole: wp.array3d(
     own entry is added up.
     """
     v = wp.tid()
-    t = circuit.rest.shape[0]
+    t = circuit.empty_maxwell.shape[0]
     nodes = near.columns[v] - t
     for step in range(nodes):
         p = t + nodes - 1 - step
@@ -115,7 +116,7 @@ def eliminate(circuit: Circuit, near: NearBodies, left: Left, whole: wp.array3d(
             if real > circuit.screened[i, j]:  # the lesser of NaN and a number would be the number
                 real = circuit.screened[i, j]
             whole[i, j, v] = wp.vec2d(
-                circuit.rest[i, j] + wp.float64(real), wp.float64(circuit.unit) * value[1]
+                circuit.empty_maxwell[i, j] + wp.float64(real), wp.float64(circuit.unit) * value[1]
             )
     for step in range(t - circuit.driven):
         _eliminate(whole, t - 1 - step, v)
@@ -188,7 +189,7 @@ def report(
 
 @wp.kernel
 def follow(
-    circuit: Circuit, cut: WarpCut, whole: wp.array3d(dtype=wp.vec2d),
+    circuit: Circuit, cut: WarpActiveTree, whole: wp.array3d(dtype=wp.vec2d),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Potential of each terminal and node while an electrode is at 1 V, (t, n, v).
@@ -240,7 +241,7 @@ def _local_slope(
 
 @wp.kernel
 def slopes(
-    circuit: Circuit, gap: GapLaw, near: NearBodies, cut: WarpCut, slopes: Slopes,
+    circuit: Circuit, gap: GapLaw, near: NearBodies, cut: WarpActiveTree, slopes: Slopes,
     out: wp.array4d(dtype=wp.spatial_vector),
 ):  # fmt: skip
     """Derivative of the matrices by the pose of each body [F/m], [F/rad], (v, b, n, n)."""

@@ -1,6 +1,6 @@
 """Outlines of bodies as the Warp kernels take them: nearest points of primitives and meshes.
 
-The twin of these functions is :mod:`capsense.elements.outline`. Ways to the nearest point are
+The twin of these functions is :mod:`capsense.solver.bodies.outline`. Ways to the nearest point are
 worked out, not the point itself: near contact a way is short, and has all digits of its precision.
 """
 
@@ -13,10 +13,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from capsense.elements import outline
-from capsense.elements.rigid import RigidShape
 from capsense.fleet.warp_mesh import LEVELS, Hit, Outlines, farthest_vertex, to_mesh
 from capsense.scene.mesh_shape import TriangleShape
+from capsense.solver.bodies import outline
+from capsense.solver.tree.rigid import RigidShape
 
 wp.set_module_options({"enable_backward": False})
 

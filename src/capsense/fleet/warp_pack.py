@@ -9,20 +9,20 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from capsense.elements.matter import UNIT
-from capsense.elements.rigid import RigidShape
 from capsense.field.background import Terminals
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet.bodies import Bodies
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.tree.matter import UNIT
+from capsense.solver.tree.rigid import RigidShape
 
 
 def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     """The Green's function of a design, and how many columns terminals and nodes have."""
     out, green = warp_cut.Response(), solver.green
-    lead = pairs.COLUMNS * -(-(green.terminals + slots) // pairs.COLUMNS)
+    phi_columns = pairs.COLUMNS * -(-(green.terminals + slots) // pairs.COLUMNS)
     near, _, far = green.levels  # the middle level is not used here
     sources = np.concatenate([far.sources.T, near.sources.T]).astype(np.float32)
     (count, few), size = far.table.shape, warp_cut.SOURCES
@@ -38,15 +38,15 @@ def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     out.table = wp.array(parts, dtype=warp_cut.row, device=device)
     out.columns = wp.array(columns, dtype=warp_cut.many, device=device)
     out.far, out.passes = count, width // warp_cut.WIDTH
-    out.first, out.lead = green.lead, lead
+    out.first, out.phi_columns = green.phi_columns, phi_columns
     out.terminals, out.middle = green.terminals, wp.vec3(*solver.middle)
     out.length = solver.length
     out.extent, out.validity = green.extent, green.gap.validity
     out.floor = green.floor
-    out.cover = 1e3 if green.gap.curvature else min(green.cover, 1e3)  # bent films have no face
+    out.has_face = int(green.space.has_face and green.gap.curvature == 0.0)
     out.blend0, out.blend1 = green.blends[-1].tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (
-        (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.room)
+        (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.active_bounds)
     )
     return out
 
@@ -67,10 +67,10 @@ def pack_shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any
     """Lay shapes out one behind the other."""
     trees = [shape.tree for shape in shapes]
     sizes = np.array([len(shape.panels) for shape in shapes])
-    blocks = [shape.energy.ravel() for shape in shapes]
-    soft = bodies.shapes["impedance"] != 0
+    blocks = [shape.potential_coefficients.ravel() for shape in shapes]
+    soft = bodies.shapes["neumann_to_dirichlet"] != 0
     inside = [
-        (shape.impedance if s else np.zeros_like(shape.energy)).ravel()
+        (shape.neumann_to_dirichlet if s else np.zeros_like(shape.potential_coefficients)).ravel()
         for shape, s in zip(shapes, soft, strict=True)
     ]
 
@@ -83,10 +83,10 @@ def pack_shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any
     out.block = array(np.concatenate([[0], np.cumsum(sizes**2)[:-1]]), wp.int64)
     out.radius = array(bodies.radius, wp.float32)
     for name, kind in (
-        ("kids", wp.int32), ("function", wp.int32), ("charge", wp.float32), ("center", wp.vec3),
-        ("points", wp.vec3), ("extent", wp.float32), ("soft", wp.float32),
+        ("children", wp.int32), ("function", wp.int32), ("charge", wp.float32), ("center", wp.vec3),
+        ("points", wp.vec3), ("extent", wp.float32), ("softening_length", wp.float32),
     ):  # fmt: skip
         setattr(out, name, array(joined(name), kind))
-    out.energy = array(np.concatenate(blocks), wp.float32)
-    out.impedance = array(np.concatenate(inside), wp.float32)
+    out.potential_coefficients = array(np.concatenate(blocks), wp.float32)
+    out.neumann_to_dirichlet = array(np.concatenate(inside), wp.float32)
     return out

@@ -1,19 +1,28 @@
 """The step of many environments as Warp kernels: potentials on leaves, pairs of them, and forces.
 
-The twins of these kernels are :mod:`capsense.surface.leaf_kernels`, ``pair_kernels`` and
-``gradient_kernels``; see :mod:`capsense.fleet.warp_cut` for what they work with. Lengths in metres,
-4π eps0 = 1.
+The twins of these kernels are :mod:`capsense.solver.placement.placement_kernels`, ``pair_kernels``
+and ``gradient_kernels``; see :mod:`capsense.fleet.warp_cut` for what they work with. Lengths in
+metres, 4π eps0 = 1.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from capsense.elements.mean_kernels import FAR
 from capsense.field.green_kernels import LEAST
-from capsense.fleet.warp_cut import WIDTH, Response, WarpCut, four, idle, lift_back, row, smooth
-from capsense.surface.pair_kernels import _WIDE as WIDE
-from capsense.surface.pair_kernels import BARRIER
+from capsense.fleet.warp_cut import (
+    WIDTH,
+    Response,
+    WarpActiveTree,
+    four,
+    idle,
+    lift_back,
+    row,
+    smooth,
+)
+from capsense.solver.interaction.pair_kernels import _WIDE as WIDE
+from capsense.solver.interaction.pair_kernels import WALL_PENALTY
+from capsense.solver.tree.mean_kernels import FAR
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -22,7 +31,7 @@ COLUMNS = 8
 some = wp.types.vector(length=COLUMNS, dtype=wp.float32)
 pulls = wp.types.matrix(shape=(COLUMNS, 6), dtype=wp.float32)
 _WIDTH, _COLUMNS, _FAR, _WIDE = (wp.constant(x) for x in (WIDTH, COLUMNS, FAR, WIDE))
-_BARRIER, _STIFF = wp.constant(BARRIER), wp.constant(600.0)
+_WALL_PENALTY, _STIFF = wp.constant(WALL_PENALTY), wp.constant(600.0)
 """Energy of charge that is out of reach [1/m]; with losses at most the second number [m] over the
 square of a large cluster's extent: more of it would hide what is in reach, see ``warp_cut.weigh``.
 """
@@ -31,7 +40,7 @@ _NEAR_LEAST, _FAR_LEAST = wp.constant(LEAST[0]), wp.constant(LEAST[-1])
 
 @wp.struct
 class Leaf:
-    """One leaf in the sensor frame, as ``WarpCut`` has it."""
+    """One leaf in the sensor frame, as ``WarpActiveTree`` has it."""
 
     points: four
     unlifted: four  # the same before they were lifted off the design
@@ -43,21 +52,21 @@ class Leaf:
 
 
 @wp.func
-def leaf_of(cut: WarpCut, i: int, v: int):
+def leaf_of(cut: WarpActiveTree, i: int, v: int):
     """A leaf that was placed."""
     out = Leaf()
     out.points = cut.points[i, v]
     out.unlifted = cut.unlifted[i, v]
     out.lifted = cut.lifted[i, v]
     out.extent = cut.extent[i, v]
-    out.soft = cut.soft[i, v]
-    out.beyond = cut.beyond[i, v]
+    out.softening_length = cut.softening_length[i, v]
+    out.outside_fraction = cut.outside_fraction[i, v]
     out.near = cut.near[i, v]
     return out
 
 
 @wp.func
-def body_of(cut: WarpCut, leaf: int):
+def body_of(cut: WarpActiveTree, leaf: int):
     """Whose leaf it is."""
     n = cut.number.shape[0]
     return wp.where(leaf < n, leaf // cut.clusters, (leaf - n) // (2 * cut.clusters))
@@ -84,13 +93,15 @@ def first_source(green: Response, leaf: Leaf):
 def last_source(green: Response, leaf: Leaf):
     """The end of the sources that count at a leaf; nothing counts beyond the walls."""
     stop = wp.where(leaf.near > 0.0, green.sources.shape[0], green.far)
-    return wp.where(leaf.beyond < 1.0, stop, 0)
+    return wp.where(leaf.outside_fraction < 1.0, stop, 0)
 
 
 @wp.func
 def share_of(green: Response, leaf: Leaf, s: int):
     """What a source counts at each of a leaf's four points."""
-    return 0.25 * (1.0 - leaf.beyond) * wp.where(s < green.far, 1.0 - leaf.near, leaf.near)
+    return (
+        0.25 * (1.0 - leaf.outside_fraction) * wp.where(s < green.far, 1.0 - leaf.near, leaf.near)
+    )
 
 
 @wp.func
@@ -109,7 +120,7 @@ def seen(green: Response, leaf: Leaf, s: int):
 
 
 @wp.kernel
-def rows(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
+def rows(green: Response, cut: WarpActiveTree, out: wp.array3d(dtype=wp.float32)):
     """Means of φ⁰ and ψ over all clusters, (n, w, v), up to a view's width: 64 columns a thread."""
     i, part, v = wp.tid()
     if part * _WIDTH >= cut.width[v]:
@@ -151,7 +162,7 @@ def _between(a: four, b: four, fourth: float):
 
 
 @wp.func
-def mean(a: Leaf, cut: WarpCut, j: int, v: int, mirrored: float, floor: float):
+def mean(a: Leaf, cut: WarpActiveTree, j: int, v: int, mirrored: float, floor: float):
     """Mean of 1/r between two clusters, the second one mirrored in the floor where that is 1."""
     b = _facing(cut.points[j, v], mirrored, floor)
     d = 0.5 * (a.points[0] + a.points[3] - b[0] - b[3])
@@ -171,20 +182,20 @@ def mean(a: Leaf, cut: WarpCut, j: int, v: int, mirrored: float, floor: float):
         aw = wp.dot(w, d)
         along = 3.0 * (ax * ax + ay * ay + az * az + aw * aw) * second
         return inverse * (1.0 + 0.5 * (along - whole) * second)
-    return _between(a.points, b, _fourth(wp.max(a.soft, cut.soft[j, v])))
+    return _between(a.points, b, _fourth(wp.max(a.softening_length, cut.softening_length[j, v])))
 
 
 @wp.func
-def more(a: Leaf, cut: WarpCut, j: int, v: int):
+def more(a: Leaf, cut: WarpActiveTree, j: int, v: int):
     """What two clusters of a body meet each other more for being lifted off the design."""
-    fourth = _fourth(wp.max(a.soft, cut.soft[j, v]))
+    fourth = _fourth(wp.max(a.softening_length, cut.softening_length[j, v]))
     return _between(a.points, cut.points[j, v], fourth) - _between(
         a.unlifted, cut.unlifted[j, v], fourth
     )
 
 
 @wp.kernel
-def pairs(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
+def pairs(green: Response, cut: WarpActiveTree, out: wp.array3d(dtype=wp.float32)):
     """Mean of 1/r between bodies, and of -1/r to images in the floor, (n, n, v).
 
     They are added to what :func:`energies` and :func:`from_functions` left, in views that have it.
@@ -203,8 +214,8 @@ def pairs(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
         elif i != j and leaf.lifted + cut.lifted[j, v] > 0:
             value += more(leaf, cut, j, v)
         if i == j:
-            x = cut.beyond[i, v]
-            barrier = _BARRIER
+            x = cut.outside_fraction[i, v]
+            barrier = _WALL_PENALTY
             if cut.walled[v] == 0:
                 barrier = wp.min(barrier, _STIFF / (cut.extent[i, v] * cut.extent[i, v]))
             value += barrier * x * x * x
@@ -214,12 +225,12 @@ def pairs(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
 
 @wp.kernel
 def bound_images(
-    green: Response, cut: WarpCut, rows: wp.array3d(dtype=wp.float32),
+    green: Response, cut: WarpActiveTree, rows: wp.array3d(dtype=wp.float32),
     pairs: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Let no cluster meet its images more than in a mirror, as ``pair_kernels.bound_images``."""
     i, v = wp.tid()
-    if cut.node[i, v] < 0 or green.cover > 1.0:
+    if cut.node[i, v] < 0 or green.has_face == 0:
         return
     leaf = leaf_of(cut, i, v)
     face = green.box1[2]
@@ -306,7 +317,7 @@ def _near(d: wp.vec3, fourth: float):
 
 @wp.func
 def pair_force(
-    green: Response, a: Leaf, cut: WarpCut, j: int, v: int, mirrored: float, origin: wp.vec3
+    green: Response, a: Leaf, cut: WarpActiveTree, j: int, v: int, mirrored: float, origin: wp.vec3
 ):  # fmt: skip
     """Force on a cluster, and torque about an origin, of the mean of 1/r to another."""
     b = _facing(cut.points[j, v], mirrored, green.floor)
@@ -334,7 +345,7 @@ def pair_force(
         torque = wp.cross(0.5 * (a.points[0] + a.points[3]) - origin, force)
         torque += 3.0 * fifth * wp.cross(ax * x + ay * y, d)
     else:
-        fourth = _fourth(wp.max(a.soft, cut.soft[j, v]))
+        fourth = _fourth(wp.max(a.softening_length, cut.softening_length[j, v]))
         for p in range(4):
             pull = wp.vec3()
             for q in range(4):
@@ -350,7 +361,7 @@ def pair_force(
 
 @wp.kernel
 def forces(
-    green: Response, cut: WarpCut, charge: wp.array3d(dtype=wp.float32),
+    green: Response, cut: WarpActiveTree, charge: wp.array3d(dtype=wp.float32),
     strength: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.spatial_vector),
 ):  # fmt: skip
     """Gradient of terminals' potentials at each leaf, and its torque about its body's origin.
@@ -359,7 +370,7 @@ def forces(
     """
     i, chunk, v = wp.tid()
     first = _COLUMNS * chunk
-    if idle(cut, green.lead, first, v):
+    if idle(cut, green.phi_columns, first, v):
         return
     total = pulls()
     if cut.node[i, v] >= 0:

@@ -26,7 +26,7 @@ from capsense.fleet.warp_gap import (
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_near import GapLaw, NearBodies, nearest_of
 from capsense.fleet.warp_outline import nearest
-from capsense.surface.gap_kernels import REACH
+from capsense.solver.gap.gap_kernels import REACH
 
 wp.set_module_options({"enable_backward": False})
 

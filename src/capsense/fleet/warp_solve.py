@@ -1,6 +1,6 @@
 """The step of many environments as Warp kernels: the matrix, its solution, what electrodes see.
 
-The twin of these kernels is :mod:`capsense.surface.solve_kernels` with the same cut.
+The twin of these kernels is :mod:`capsense.solver.system.system_kernels` with the same cut.
 
 What has losses is complex: a factor has its real part in the lower half of ``matrix`` and its
 imaginary part in the upper one, but for the diagonal's, which is in ``loss``. Functions that are
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.fleet.warp_cut import Places, Shapes, WarpCut
+from capsense.fleet.warp_cut import Places, Shapes, WarpActiveTree
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -20,7 +20,7 @@ _DROPPED = wp.constant(1e-5)
 
 
 @wp.kernel
-def to_functions(cut: WarpCut, limited: int, values: wp.array3d(dtype=wp.float32)):
+def to_functions(cut: WarpActiveTree, limited: int, values: wp.array3d(dtype=wp.float32)):
     """Integrate what clusters have in the first index with the charge functions, in place.
 
     ``limited`` says that the second index is of columns, of which a view has its width.
@@ -49,15 +49,17 @@ def own(shapes: Shapes, places: Places, e: int, b: int, x: int, y: int):
     """Energy of two functions of a body, complex."""
     u = places.choice[e, b]
     place = shapes.block[u] + wp.int64(x * shapes.functions[u] + y)
-    out = wp.vec2(shapes.energy[place], 0.0)
-    inside = places.softness[e, b]
+    out = wp.vec2(shapes.potential_coefficients[place], 0.0)
+    inside = places.inverse_susceptibility[e, b]
     if inside[0] != 0.0 or inside[1] != 0.0:
-        out += inside * shapes.impedance[place]
+        out += inside * shapes.neumann_to_dirichlet[place]
     return out / places.scale[e, b]
 
 
 @wp.kernel
-def energies(shapes: Shapes, places: Places, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
+def energies(
+    shapes: Shapes, places: Places, cut: WarpActiveTree, out: wp.array3d(dtype=wp.float32)
+):
     """Energies of the shapes' functions, (n, n, v), where views have others, see ``weigh``."""
     i, j, v = wp.tid()
     if cut.walled[v] == 0:
@@ -74,7 +76,7 @@ def energies(shapes: Shapes, places: Places, cut: WarpCut, out: wp.array3d(dtype
 
 @wp.kernel
 def from_functions(
-    cut: WarpCut, walled: int, values: wp.array3d(dtype=wp.float32)
+    cut: WarpActiveTree, walled: int, values: wp.array3d(dtype=wp.float32)
 ):  # fmt: skip
     """What clusters have of what the shapes' functions have in the first index, in place.
 
@@ -97,7 +99,7 @@ def from_functions(
 
 @wp.kernel
 def assemble(
-    shapes: Shapes, places: Places, cut: WarpCut, start: int,
+    shapes: Shapes, places: Places, cut: WarpActiveTree, start: int,
     potentials: wp.array3d(dtype=wp.float32), matrix: wp.array3d(dtype=wp.float32),
     loss: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
@@ -127,7 +129,7 @@ def assemble(
             if apart:
                 value += own(shapes, places, e, b, x, y)
             if x == 0 and y == 0 and not joined:
-                value += cut.tie[b, v]
+                value += cut.ground_elastance[b, v]
         if apart and joined and first == c:
             value -= own(shapes, places, e, c, 0, y)
         if apart and another and other == b:
@@ -162,7 +164,7 @@ def _root(x: wp.vec2):
 
 @wp.kernel
 def factorise(
-    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), dropped: wp.array(dtype=wp.int32)
+    cut: WarpActiveTree, matrix: wp.array3d(dtype=wp.float32), dropped: wp.array(dtype=wp.int32)
 ):
     """Cholesky factor L of every real matrix."""
     v = wp.tid()
@@ -187,7 +189,7 @@ def factorise(
 
 @wp.kernel
 def factorise_lossy(
-    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
+    cut: WarpActiveTree, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
     dropped: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Factor L of every complex symmetric matrix L Lᵀ, without pivots: see ``_dense.eliminate``."""
@@ -226,7 +228,7 @@ def factorise_lossy(
 
 @wp.kernel
 def forward(
-    cut: WarpCut, terminals: int, given: wp.array3d(dtype=wp.float32),
+    cut: WarpActiveTree, terminals: int, given: wp.array3d(dtype=wp.float32),
     matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
     potentials: wp.array3d(dtype=wp.float32), quadrature: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
@@ -269,7 +271,7 @@ def forward(
 
 @wp.kernel
 def charges(
-    cut: WarpCut, lead: int, matrix: wp.array3d(dtype=wp.float32),
+    cut: WarpActiveTree, phi_columns: int, matrix: wp.array3d(dtype=wp.float32),
     loss: wp.array2d(dtype=wp.float32), potentials: wp.array3d(dtype=wp.float32),
     quadrature: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
@@ -288,7 +290,7 @@ def charges(
         elif lossy:
             for k in range(i + 1, n):
                 below = wp.vec2(matrix[k, i, v], matrix[i, k, v])
-                total -= times(below, wp.vec2(out[k, t, v], out[k, lead + t, v]))
+                total -= times(below, wp.vec2(out[k, t, v], out[k, phi_columns + t, v]))
             pivot[1] = loss[i, v]
             total = over(total, pivot)
         else:
@@ -296,7 +298,7 @@ def charges(
                 total[0] -= matrix[k, i, v] * out[k, t, v]
             total[0] = total[0] / pivot[0]
         out[i, t, v] = total[0]
-        out[i, lead + t, v] = total[1]
+        out[i, phi_columns + t, v] = total[1]
 
 
 @wp.struct

@@ -1,6 +1,6 @@
 """Contact mechanics of a cover in many environments, as Warp kernels: overlaps and forces.
 
-The twin of these kernels is :mod:`capsense.surface.touch_kernels`. Lengths are over the solver's
+The twin of these kernels is :mod:`capsense.solver.gap.touch_kernels`. Lengths are over the solver's
 ``length``, forces in newtons.
 """
 
@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from capsense.fleet.warp_cut import WarpCut
+from capsense.fleet.warp_cut import WarpActiveTree
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_near import NearBodies, nearest_of
 from capsense.fleet.warp_outline import farthest_point, middle_height, reach_down
-from capsense.surface.touch_kernels import COARSE, EXACT, FINE, STEPS, Foundation
+from capsense.solver.gap.touch_kernels import COARSE, EXACT, FINE, STEPS, Foundation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -71,7 +71,7 @@ def pack_foundation(cover: Foundation, length: float, device: Any) -> WarpFounda
 
 @wp.kernel
 def find_contacts(
-    outlines: Outlines, cover: WarpFoundation, cut: WarpCut, near: NearBodies,
+    outlines: Outlines, cover: WarpFoundation, cut: WarpActiveTree, near: NearBodies,
     forces: wp.array2d(dtype=wp.float32), out: CoverContacts,
 ):  # fmt: skip
     """Enter bodies that may be pressed in, and a coarse grid of cells below each."""

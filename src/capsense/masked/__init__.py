@@ -21,7 +21,7 @@ from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Design, Domain, Electrode
 from capsense.design.stl import sheet_surface, weld
 from capsense.errors import CapSenseError, DesignError, MeshError, SceneError
-from capsense.field.background import Change, MeshSettings
+from capsense.field.background import CapacitanceChange, MeshSettings
 from capsense.field.boundary import terminals
 from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh, kuhn_tets
@@ -357,9 +357,9 @@ class MaskedScenes:
     def charges(self) -> None:
         """Not offered."""
 
-    def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]:
+    def solve_each(self, scenes: Sequence[Scene]) -> list[CapacitanceChange | CapSenseError]:
         """Return what each of many scenes changes, from rest, or what was wrong with it."""
-        out: list[Change | CapSenseError] = []
+        out: list[CapacitanceChange | CapSenseError] = []
         for scene in scenes:
             self.reset()
             try:
@@ -368,7 +368,9 @@ class MaskedScenes:
                 out.append(error)
         return out
 
-    def solve(self, scene: Scene, *, jacobian: bool = False, time: float | None = None) -> Change:
+    def solve(
+        self, scene: Scene, *, jacobian: bool = False, time: float | None = None
+    ) -> CapacitanceChange:
         """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
         assert not jacobian
         inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)
@@ -399,4 +401,4 @@ class MaskedScenes:
         stats = self._solver.stats
         error = math.inf if contact else self._solver.tolerance * float(np.abs(matrix).max())
         free = self._mesh.n_points - stats.grounded_nodes
-        return Change(matrix - self.empty, error, int(stats.iterations), free)
+        return CapacitanceChange(matrix - self.empty, error, int(stats.iterations), free)

@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from capsense._thread_pool import OneAtATime
+from capsense._thread_pool import ForkSafeRLock
 from capsense.adapters import AttachedSensor
 from capsense.codec import design_to_json
 from capsense.errors import ReadoutError, RecordingError, require_package
@@ -70,7 +70,7 @@ class Recorder:
     ) -> None:
         ros.require()
         self.path = Path(path)
-        self._told, self._one = False, OneAtATime()
+        self._told, self._one = False, ForkSafeRLock()
         self.count = 0
         """Steps recorded so far."""
         if not isinstance(source, Simulator | AttachedSensor):

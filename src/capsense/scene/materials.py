@@ -58,7 +58,7 @@ class ColeCole:
 
 
 DATA: Mapping[str, Any] = tomllib.loads(
-    resources.files("capsense.scene").joinpath("materials.toml").read_text(encoding="utf-8")
+    resources.files("capsense").joinpath("materials.toml").read_text(encoding="utf-8")
 )
 """The tables of ``materials.toml``: materials, aliases, tissues, paths to ground."""
 

@@ -1,0 +1,161 @@
+"""Points in front of a design, compiled: coordinates of its face, walls, and the lift.
+
+Bodies are solved for no nearer to the face than the Green's function is valid. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from capsense._jit import kernel
+
+WALL_FADE_LENGTH = 0.01
+"""Bodies fade out over this distance beyond the room, and behind the face of a flat design, over
+the domain's shortest side."""
+DEEP, STEEP = (2.3, 3.8), 4.0
+"""What is deeper behind the face of a flat design than the first of these, over the validity
+distance, comes to be screened by it, over the second; depth from the sides counts so many times."""
+
+
+class Space(NamedTuple):
+    """The surroundings of a design, as kernels take them that are called for single points."""
+
+    has_face: bool
+    """Whether the design has a face; shells that are no bent films have none."""
+    face: NDArray[Any]
+    """Corners of the design in coordinates of its face [m], shape (2, 3)."""
+    curvature: float
+    """Curvature of the face about the y axis [1/m]: 0 of a flat one, 1 / R of a bent film."""
+    active_bounds: NDArray[Any]
+    """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
+    extent: float
+    """Shortest side of the domain [m]."""
+    validity: float
+    """Distance from the face down to which the Green's function is valid [m]."""
+    limit: float
+    """Largest compression of the cover [m]."""
+
+
+@kernel
+def on_face(x, y, z, curvature):
+    """Coordinates of the face of a point of the sensor frame [m]."""
+    if curvature == 0.0:
+        return x, y, z
+    up = z + 1.0 / curvature
+    return math.atan2(x, up) / curvature, y, math.sqrt(x * x + up * up) - 1.0 / curvature
+
+
+@kernel
+def off_face(x, y, z, curvature):
+    """Point of the sensor frame of coordinates of the face [m]."""
+    if curvature == 0.0:
+        return x, y, z
+    far, angle = z + 1.0 / curvature, x * curvature
+    return far * math.sin(angle), y, far * math.cos(angle) - 1.0 / curvature
+
+
+@kernel
+def smooth(x):
+    """Smoothstep: 0 up to 0, 1 from 1 on."""
+    x = min(1.0, max(0.0, x))
+    return x * x * (3.0 - 2.0 * x)
+
+
+@kernel
+def outside_fraction(points, space, middle):
+    """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face.
+
+    ``middle`` is room for a point, shape (3,).
+    """
+    out, depth = 0.0, math.inf
+    for i in range(3):
+        c = 0.5 * (points[0, i] + points[3, i])
+        off = max(space.active_bounds[0, i] - c, c - space.active_bounds[1, i], 0.0)
+        out += off * off
+        middle[i] = c
+    _put(middle, on_face(middle[0], middle[1], middle[2], space.curvature))
+    for i in range(3):
+        c = middle[i]
+        if i < 2:
+            depth = min(depth, STEEP * (c - space.face[0, i]), STEEP * (space.face[1, i] - c))
+        else:
+            depth = min(depth, space.face[1, 2] - space.limit - c)
+    deep = (depth / space.validity - DEEP[0]) / DEEP[1] if space.has_face else 0.0
+    return smooth(max(math.sqrt(out) / (WALL_FADE_LENGTH * space.extent), deep))
+
+
+@kernel
+def held_off(distance, length):
+    """A distance that becomes ``length`` in contact, and stays from twice that on, C¹ [m]."""
+    if distance >= 2.0 * length:
+        return distance
+    return length + distance * distance / (4.0 * length)
+
+
+@kernel
+def settle(points, space):
+    """Move points (k, 3) in the cover up to its face: what is pressed into it is in contact."""
+    for q in range(points.shape[0]):
+        depth = space.face[1, 2] - points[q, 2]
+        if 0.0 < depth <= space.limit:
+            inside = True
+            for i in range(2):
+                x = points[q, i]
+                inside = inside and space.face[0, i] < x < space.face[1, i]
+            if inside:
+                points[q, 2] = space.face[1, 2]
+
+
+@kernel
+def _put(out, point):
+    out[0], out[1], out[2] = point
+
+
+@kernel
+def keep_off(points, space):
+    """Settle and lift points (k, 3) of the sensor frame, in front of a design with a face."""
+    bent = space.curvature != 0.0
+    if bent:
+        for q in range(points.shape[0]):
+            p = points[q]
+            _put(p, on_face(p[0], p[1], p[2], space.curvature))
+    settle(points, space)
+    lift(points, space.validity, space.face)
+    if bent:
+        for q in range(points.shape[0]):
+            p = points[q]
+            _put(p, off_face(p[0], p[1], p[2], space.curvature))
+
+
+@kernel
+def lift(points, gap, box):
+    """Keep points (k, 3) off a design: a distance d < 2 gap becomes gap + d² / (4 gap).
+
+    Points and ``box`` are in coordinates of the face. The space behind the design counts as within
+    it.
+    """
+    for q in range(points.shape[0]):
+        square, depth, axis, side = 0.0, 1.0, 2, 1
+        for i in range(3):
+            for k in range(2):
+                if i == 2 and k == 0:
+                    continue
+                off = points[q, i] - box[1, i] if k == 1 else box[0, i] - points[q, i]
+                square += max(off, 0.0) ** 2
+                if -off < depth:
+                    depth, axis, side = -off, i, k
+        way = math.sqrt(square)
+        if way >= 2.0 * gap:
+            continue
+        if way == 0.0:
+            points[q, axis] = box[1, axis] + gap if side == 1 else box[0, axis] - gap
+            continue
+        ratio = held_off(way, gap) / way
+        for i in range(3):
+            edge = min(points[q, i], box[1, i])
+            if i < 2:
+                edge = max(edge, box[0, i])
+            points[q, i] = edge + ratio * (points[q, i] - edge)

@@ -1,0 +1,1 @@
+"""Bodies as panels: shapes, meshes, mutual potentials of panels, distances to surfaces."""

@@ -1,0 +1,267 @@
+"""Blocks of a rigid body alone in space: potentials of its panels, their fluxes, its inside.
+
+Metres, 4π eps0 = 1. The unknown of a panel is its charge, spread evenly.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as sl
+from numpy.typing import NDArray
+
+from capsense.errors import SceneError
+from capsense.solver.bodies import panel_kernels as kernels
+from capsense.solver.bodies.panels import SurfacePanels
+
+Array = NDArray[np.float64]
+
+_BEND = 0.5
+"""How far the points on touching panels crowd towards edges, where the other's potential bends."""
+_WALL_PENALTY = 1e6
+"""Impedance between unconnected parts of a body, over the mean of the diagonal."""
+_LEAST_RATE = 1e-3
+"""Least rate (of at most 4π) at which a pattern of charge is let through the inside."""
+
+
+def free_block(panels: SurfacePanels) -> Array:
+    """Mean potentials of unit charges on the panels of a body alone in space.
+
+    Args:
+        panels: Panels of the body.
+
+    Returns:
+        F [1/m], shape (n, n), symmetric and positive definite: F_kl is the mean over panel k of
+        the potential of unit charge spread evenly on panel l.
+    """
+    out = np.empty((len(panels), len(panels)))
+    kernels.fill_free(_packed(panels), panels.mirrors, out)
+    return out
+
+
+def flux_block(panels: SurfacePanels) -> Array:
+    """Fluxes of the fields of unit charges on the panels through the panels.
+
+    Args:
+        panels: Panels of the body.
+
+    Returns:
+        Shape (n, n), the integral of E along the normal over panel k from unit charge on panel l;
+        principal value, zero on the diagonal. Columns of a closed surface add up to 2π.
+    """
+    p = _packed(panels)
+    out = np.empty((len(panels), len(panels)))
+    kernels.fill_flux(p, out)
+    return out
+
+
+def impedance(panels: SurfacePanels, free: Array) -> Array:
+    """What a dielectric adds to the free-space block: F + Z / (eps − 1) on charges that add to 0.
+
+    With u the potential on the surface, a body of relative permittivity eps carries the bound
+    charge x = −(eps − 1) Y u, 4π Y being the operator from u to its flux inside. In terms of the
+    layer of charge y = F⁻¹ u that makes u inside, this flux is (2π − B) y, B the flux block;
+    F B is symmetric (Calderón's identity) up to the panels' size and is made so, which gives
+    Z = 4π F (2πF − F B)⁻¹ F on charges without sum. The patterns of charge that linear and
+    quadratic potentials make inside, known in closed form, are then put in by the update of
+    Broyden, Fletcher, Goldfarb and Shanno, which keeps Z positive; uniform fields are so exact.
+
+    Args:
+        panels: Panels of a closed surface, n of them.
+        free: Their free-space block [1/m], shape (n, n).
+
+    Returns:
+        Z [1/m], shape (n, n), symmetric, positive semidefinite; zero on the equilibrium charge of
+        the whole body. Charge that would cross between unconnected parts finds a very large Z.
+
+    Raises:
+        SceneError: The surface is open.
+    """
+    if not panels.closed:
+        raise SceneError(
+            "the surface is open, so it has no inside; a dielectric needs a closed surface"
+        )
+    region = _regions(panels)
+    inside = np.eye(region.max() + 1)[region]
+    charge = sl.cho_solve(sl.cho_factor(free, lower=True), inside)
+    mixed = free @ flux_block(panels)
+    passed = 2 * math.pi * free - 0.5 * (mixed + mixed.T)
+    passed = _projected(passed, charge, inside)
+    z = _projected(_inverted(passed, free, inside), charge, inside)
+    for potential, flux in reversed(_harmonics(panels)):
+        u = (potential[:, :, None] * inside[:, None, :]).reshape(len(panels), -1)
+        g = (flux[:, :, None] * inside[:, None, :]).reshape(len(panels), -1)
+        own = charge * inside
+        weights = own / own.sum(axis=0)
+        u -= inside @ (weights.T @ u)
+        z = _updated(z, u, g)
+    total = charge.sum(axis=1)
+    crossing = inside - np.outer(np.ones(len(panels)), inside.T @ total / total.sum())
+    if inside.shape[1] > 1:
+        z += _WALL_PENALTY * float(np.diag(z).mean()) * (crossing @ crossing.T)
+    return z
+
+
+def _projected(matrix: Array, charge: Array, inside: Array) -> Array:
+    """PᵀMP, P taking the equilibrium charges of the parts out until no part has net charge."""
+    weights = charge @ np.linalg.inv(inside.T @ charge)
+    side = (matrix @ weights) @ inside.T
+    corner = inside @ (weights.T @ matrix @ weights) @ inside.T
+    return matrix - side - side.T + corner
+
+
+def _inverted(passed: Array, free: Array, inside: Array) -> Array:
+    """4π F G⁺ F, where G may be singular on the equilibrium charges and nowhere else."""
+    lifted = passed + float(np.abs(passed).mean()) * (inside @ inside.T)
+    try:
+        factor = np.linalg.cholesky(lifted)
+    except np.linalg.LinAlgError:
+        rates, modes = sl.eigh(lifted, free)
+        half = (free @ modes) / np.sqrt(np.maximum(rates, _LEAST_RATE))
+        return 4 * math.pi * half @ half.T
+    half = sl.solve_triangular(factor, free, lower=True, check_finite=False)
+    return 4 * math.pi * half.T @ half
+
+
+def _harmonics(panels: SurfacePanels) -> list[tuple[Array, Array]]:
+    """Linear (n, 3) and quadratic (n, 5) potentials, means over panels, and fluxes out of them."""
+    x = panels.centers - panels.areas @ panels.centers / panels.areas.sum()
+    second = panels.moments + x[:, :, None] * x[:, None, :]
+    normal = panels.areas[:, None] * panels.normals
+    forms = np.zeros((5, 3, 3))
+    for k, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
+        forms[k, a, b] = forms[k, b, a] = 0.5
+    forms[3] = np.diag([1.0, -1.0, 0.0])
+    forms[4] = np.diag([-0.5, -0.5, 1.0])
+    potential = np.einsum("kab,nab->nk", forms, second)
+    flux = 2 * np.einsum("na,kab,nb->nk", normal, forms, x)
+    return [(x, normal), (potential, flux)]
+
+
+def _updated(z: Array, potential: Array, flux: Array) -> Array:
+    """The Z nearest in kind that takes ``flux`` (n, m) to 4π ``potential``."""
+    energy = potential.T @ flux
+    inverse = np.linalg.pinv(0.5 * (energy + energy.T), rcond=1e-9, hermitian=True)
+    scaled = potential @ inverse
+    found = z @ flux
+    side = found @ scaled.T
+    corner = scaled @ (flux.T @ found + 4 * math.pi * 0.5 * (energy + energy.T)) @ scaled.T
+    return z - side - side.T + corner
+
+
+def _regions(panels: SurfacePanels) -> NDArray[np.int64]:
+    """Number of the volume that each panel bounds: cavities belong to what is round them."""
+    parts, volume = panels.parts, panels.volumes
+    solid = np.flatnonzero(volume > 0)
+    solid = solid[np.argsort(volume[solid], kind="stable")]
+    owner = np.arange(len(volume))
+    frames = panel_frames(panels)
+    for k in np.flatnonzero(volume <= 0):
+        point = panels.centers[np.argmax(parts == k)]
+        for s in solid:
+            seen = sum(kernels.solid_angle(frames[i], *point) for i in np.flatnonzero(parts == s))
+            if abs(seen) > 2 * math.pi:
+                owner[k] = s
+                break
+    _, out = np.unique(owner[parts], return_inverse=True)
+    return out.reshape(-1).astype(np.int64)
+
+
+class _Packed(NamedTuple):
+    """Panels as the kernels take them."""
+
+    flat: Array
+    """Centres, second moments xx, yy, zz, xy, xz, yz, and reaches; shape (10, n)."""
+    frames: Array
+    """Plane and edges of every panel, see :func:`panel_frames`; shape (n, 34)."""
+    areas: Array
+    """Areas [m²], shape (n,)."""
+    coarse: Array
+    """Points and weights for near pairs, shape (n, 9, 4)."""
+    fine: Array
+    """Points and weights for touching pairs, shape (n, 16, 4)."""
+    rim: Array
+    """Points and weights for a panel's own potential, shape (n, 12, 4)."""
+
+
+def _packed(panels: SurfacePanels) -> _Packed:
+    flat = np.empty((10, len(panels)))
+    flat[:3] = panels.centers.T
+    for k, (a, b) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+        flat[3 + k] = panels.moments[:, a, b]
+    trace = np.einsum("naa->n", panels.moments)
+    spread = 2 * np.einsum("nab,nab->n", panels.moments, panels.moments) - trace**2
+    flat[9] = np.sqrt(1.5 * (trace + np.sqrt(np.maximum(spread, 0.0))))
+    c = panels.corners
+    return _Packed(
+        flat, panel_frames(panels), panels.areas, _points(c, 3), _points(c, 4, _BEND), _rim(c)
+    )
+
+
+def panel_frames(panels: SurfacePanels) -> Array:
+    """Centre, axes u and v of the plane, normal (12 numbers); start, direction and length of the
+    four edges in the plane (20); twice the areas of triangles (0, 1, 2) and (0, 2, 3) (2)."""
+    edge = np.roll(panels.corners, -1, axis=1) - panels.corners
+    length = np.linalg.norm(edge, axis=2, keepdims=True)
+    u = edge[:, 0] / length[:, 0]
+    v = np.cross(panels.normals, u)
+    plane = np.stack([u, v], axis=2)
+    start = (panels.corners - panels.centers[:, None]) @ plane
+    way = (edge / np.where(length > 0, length, 1.0)) @ plane
+    b, c, d = (start[:, k] - start[:, 0] for k in (1, 2, 3))
+    return np.concatenate(
+        [
+            np.concatenate([panels.centers, u, v, panels.normals], axis=1),
+            np.concatenate([start, way, length], axis=2).reshape(len(panels), 20),
+            (b[:, :1] * c[:, 1:] - b[:, 1:] * c[:, :1]),
+            (c[:, :1] * d[:, 1:] - c[:, 1:] * d[:, :1]),
+        ],
+        axis=1,
+    )
+
+
+def _line(order: int, bend: float) -> tuple[Array, Array]:
+    """Gauss points and weights on 0 ... 1, moved towards the ends by ``bend`` of 3t² − 2t³."""
+    t, w = np.polynomial.legendre.leggauss(order)
+    t, w = 0.5 * (t + 1), 0.5 * w
+    return t + bend * (3 * t**2 - 2 * t**3 - t), w * (1 + bend * (6 * t * (1 - t) - 1))
+
+
+def _points(corners: Array, order: int, bend: float = 0.0) -> Array:
+    """Points on polygons and weights that sum to one, shape (n, order², 4)."""
+    line, along = _line(order, bend)
+    s, t = (x.ravel() for x in np.meshgrid(line, line))
+    weight = np.outer(along, along).ravel()
+    a, b, c, d = np.moveaxis(corners, 1, 0)
+    # the Jacobian of a bilinear map of a plane polygon is linear in s and t
+    sides = ((b - a, d - a), (b - a, c - b), (c - d, d - a))
+    at = [np.linalg.norm(np.cross(p, q), axis=1)[:, None] for p, q in sides]
+    jacobian = at[0] + s * (at[1] - at[0]) + t * (at[2] - at[0])
+    out = np.empty((len(corners), len(s), 4))
+    shape = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], axis=1)
+    out[..., :3] = shape @ corners
+    out[..., 3] = weight * jacobian
+    out[..., 3] /= out[..., 3].sum(axis=1, keepdims=True)
+    return out
+
+
+def _rim(corners: Array) -> Array:
+    """Points and weights whose mean potential is the mean over the panel of its own potential.
+
+    The energy of an evenly charged polygon goes with the third power of its size, so it is two
+    thirds of the sum over edges of their distance from a corner times the integral of the
+    potential along them. Two edges meet at that corner and drop out. Shape (n, 12, 4).
+    """
+    line, along = _line(6, 1.0)
+    out = np.empty((len(corners), 2, len(line), 4))
+    origin = corners[:, 0]
+    for k in (1, 2):
+        start, way = corners[:, k], corners[:, k + 1] - corners[:, k]
+        out[:, k - 1, :, :3] = start[:, None] + line[:, None] * way[:, None]
+        double = np.linalg.norm(np.cross(start - origin, way), axis=1)
+        out[:, k - 1, :, 3] = double[:, None] * along
+    points = out.reshape(len(corners), -1, 4)
+    points[..., 3] *= 4 / 3 / points[..., 3].sum(axis=1, keepdims=True)
+    return points

@@ -1,0 +1,1 @@
+"""What is nearer to the design, or to another body, than clusters resolve."""

@@ -1,0 +1,1 @@
+"""How the capacitance matrix changes with the poses of bodies."""

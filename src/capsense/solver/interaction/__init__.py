@@ -1,0 +1,1 @@
+"""What active clusters of bodies meet of each other."""

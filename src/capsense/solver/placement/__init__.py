@@ -1,0 +1,1 @@
+"""Where the active clusters are, and what the design does to them."""

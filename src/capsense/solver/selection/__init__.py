@@ -1,0 +1,1 @@
+"""Which clusters and charge functions a scene needs."""

@@ -1,0 +1,1 @@
+"""The system of equations of a scene, its solution, and the step as a whole."""

@@ -1,0 +1,141 @@
+"""The step, compiled: conductors near the design as nodes of a network; 4π eps0 = 1.
+
+With conductors at ground or at 1 V, terminals and nodes have one Maxwell matrix. A node that
+carries no charge, or is coupled to ground by a capacitance, is eliminated from it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capsense._dense import WIDTH, padded
+from capsense._jit import compiled
+from capsense.solver.system.system_kernels import System
+from capsense.solver.tree.matter import FLOATING_PENALTY
+
+
+@compiled
+def as_nodes(bodies, near, green):
+    """Make near conductors that are not at ground nodes; their records change to such at ground.
+
+    Of conductors that touch, all become one node if one of them is near.
+
+    Returns:
+        How many terminals and nodes there are; the row of each body that is a node, else -1, (b,);
+        and the capacitance of each node to ground [m].
+    """
+    count, nodes = bodies.shape[0], 0
+    node, group = np.full(count, -1), np.full(count, -1)
+    capacitance = np.zeros(count)
+    for b in range(count):
+        body = bodies[b]
+        if near[b] and (body.neutral != 0 or body.ground_elastance > 0.0) and group[body.group] < 0:
+            group[body.group] = green.terminals + nodes
+            if body.neutral == 0 and body.ground_elastance < 0.5 * FLOATING_PENALTY:
+                capacitance[nodes] = 1.0 / body.ground_elastance
+            nodes += 1
+    if nodes > 0:
+        for b in range(count):
+            node[b] = group[bodies[b].group]
+            if node[b] >= 0:
+                bodies[b].neutral, bodies[b].ground_elastance = 0, 0.0
+    return green.terminals, nodes, node, capacitance[:nodes]
+
+
+@compiled
+def with_nodes(system, functions, node, terminals, nodes):
+    """Give a system a right-hand side for each node at 1 V, behind those of the terminals."""
+    total = system.phi.shape[0]
+    phi = np.zeros((total, padded(terminals + nodes, WIDTH)))
+    for f in range(total):
+        for i in range(terminals):
+            phi[f, i] = system.phi[f, i]
+        if functions.cluster[f] < 0 and node[functions.body[f]] >= 0:
+            phi[f, node[functions.body[f]]] = -1.0
+    return System(phi, system.matrix, system.rest, system.diagonal)
+
+
+@compiled
+def potentials_of(matrix, terminals, nodes, capacitance):
+    """Potentials of terminals and nodes for each terminal at 1 V, from their Maxwell matrix [m].
+
+    Shape (terminals + nodes, terminals): those of the terminals are 0 and 1.
+    """
+    out = np.zeros((terminals + nodes, terminals))
+    own, side = np.empty((nodes, nodes)), np.empty((nodes, terminals))
+    for i in range(terminals):
+        out[i, i] = 1.0
+    for a in range(nodes):
+        for b in range(nodes):
+            own[a, b] = matrix[terminals + a, terminals + b]
+        own[a, a] += capacitance[a]
+        for i in range(terminals):
+            side[a, i] = -matrix[terminals + a, i]
+    for k in range(nodes):  # few and definite: elimination without pivots
+        for a in range(k + 1, nodes):
+            share = own[a, k] / own[k, k] if own[k, k] > 0.0 else 0.0
+            for b in range(k, nodes):
+                own[a, b] -= share * own[k, b]
+            for i in range(terminals):
+                side[a, i] -= share * side[k, i]
+    for k in range(nodes - 1, -1, -1):
+        for i in range(terminals):
+            value = side[k, i]
+            for b in range(k + 1, nodes):
+                value -= own[k, b] * out[terminals + b, i]
+            # nothing of a node may be within reach
+            out[terminals + k, i] = value / own[k, k] if own[k, k] > 0.0 else 0.0
+    return out
+
+
+@compiled
+def congruent(weights, matrix, capacitance):
+    """Reduce a matrix of terminals and nodes to the terminals by their potentials W: W' (M + C) W.
+
+    ``capacitance`` of the nodes to ground [m] adds to the diagonal; give none for an estimate.
+    """
+    size, m = weights.shape
+    half, out = np.zeros((size, m)), np.zeros((m, m))
+    for a in range(size):
+        for i in range(m):
+            value = 0.0
+            for b in range(size):
+                value += matrix[a, b] * weights[b, i]
+            k = a - m
+            if 0 <= k < capacitance.shape[0]:
+                value += capacitance[k] * weights[a, i]
+            half[a, i] = value
+    for i in range(m):
+        for j in range(i + 1):
+            value = 0.0
+            for a in range(size):
+                value += weights[a, i] * half[a, j]
+            out[i, j] = out[j, i] = value
+    return out
+
+
+@compiled
+def mixed(charge, weights, phi_columns):
+    """Charges (l, k) with terminals and nodes at 1 V, reduced to the terminals, (l, lead)."""
+    size, m = weights.shape
+    out = np.zeros((charge.shape[0], phi_columns))
+    for f in range(charge.shape[0]):
+        for i in range(m):
+            value = charge[f, i]
+            for a in range(m, size):
+                value += charge[f, a] * weights[a, i]
+            out[f, i] = value
+    return out
+
+
+@compiled
+def coarse_of(coarse, weights):
+    """Squares of amplitudes (k,) of terminals and nodes, reduced to a bound of the terminals'."""
+    size, m = weights.shape
+    out = np.zeros(m)
+    for i in range(m):
+        value = 0.0
+        for a in range(size):
+            value += np.sqrt(coarse[a]) * abs(weights[a, i])
+        out[i] = value * value
+    return out

@@ -1,0 +1,1 @@
+"""Bodies as trees of clusters: charge functions, potential coefficients, materials."""

@@ -1,1 +1,0 @@
-"""The surface core: charges on bodies against the Green's function of a design, step by step."""
