@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE.parent / "src" / "capsense"
-PACKAGES = "surface", "elements", "field"
+PACKAGES = "solver", "field"
 SETTINGS = "Preset", "GreenSettings", "Accuracy"
 """Classes whose default values count as constants."""
 NOTES = HERE / "constants.toml"
@@ -48,12 +48,17 @@ class Constant(NamedTuple):
         return f"{self.module}.{self.name}"
 
 
+def _module(path: Path) -> str:
+    """Name of a module below the package, such as ``solver.system.step``."""
+    return ".".join(path.relative_to(SOURCE).with_suffix("").parts)
+
+
 def constants() -> list[Constant]:
     """All constants of the solver, in the order of the source."""
     out: list[Constant] = []
     for package in PACKAGES:
-        for path in sorted((SOURCE / package).glob("*.py")):
-            module, tree = f"{package}.{path.stem}", ast.parse(path.read_text(encoding="utf-8"))
+        for path in sorted((SOURCE / package).rglob("*.py")):
+            module, tree = _module(path), ast.parse(path.read_text(encoding="utf-8"))
             out += _of_body(module, tree.body, _NAME.fullmatch)
             for node in tree.body:
                 if isinstance(node, ast.ClassDef) and node.name in SETTINGS:
@@ -66,10 +71,10 @@ def literals() -> Counter[str]:
     """How many numbers other than those of simple formulas are written inside functions."""
     out: Counter[str] = Counter()
     for package in PACKAGES:
-        for path in sorted((SOURCE / package).glob("*.py")):
+        for path in sorted((SOURCE / package).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.FunctionDef):
-                    out[f"{package}.{path.stem}"] += sum(
+                    out[_module(path)] += sum(
                         isinstance(n, ast.Constant)
                         and isinstance(n.value, float)
                         and n.value not in _TRIVIAL

@@ -49,7 +49,8 @@ def multiply(left, table, out):
 
 @kernel
 def multiply_part(left, table, depth, width, out):
-    """The same, of the first ``depth`` rows of the table and the first ``width`` columns only.
+    """``left @ table`` of the first ``depth`` rows of the table and the first ``width`` columns
+    only.
 
     Four rows and 32 columns at a time: their sums stay in registers.
     """

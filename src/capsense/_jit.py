@@ -224,7 +224,7 @@ def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 compiled = _jit()
 """Compiled, without Python's lock, and kept; division by zero gives infinity."""
 kernel = _jit(_nrt=False)
-"""The same without reference counts, so that nothing can be allocated inside.
+"""Compiled without reference counts, so that nothing can be allocated inside.
 
 Numba counts references to every array that is passed on or sliced, by atomic operations; they took
 more than half of the time of a scan, and a fifth of a step. Room that a kernel needs is therefore

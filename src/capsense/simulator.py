@@ -251,7 +251,8 @@ class Simulator:
             scene: What stands around the sensor.
             time: Time of the scene [s], not before that of the last step; a readout needs it, and
                 the relaxation and hysteresis of a cover follow it: without it there are none.
-            jacobian: Whether to work out ``reading.jacobian`` as well, for half a step's time.
+            jacobian: Whether to work out ``reading.jacobian`` as well; it adds about 50 % to the
+            step.
 
         Raises:
             SceneError: ``scene`` is neither a scene nor a depth frame, or has no Jacobian.

@@ -207,15 +207,15 @@ def haar(children: Array, panel: Array, charge: Array) -> Array:
 class Chosen(NamedTuple):
     """What is solved for, of one body."""
 
-    leaves: Array
+    active: Array
     """Clusters that are represented by themselves."""
-    whole: Array
+    self_weight: Array
     """How far each of these is, 1 if it is not split; the rest is left to its parts."""
     functions: Array
     """Clusters that are split."""
     fade: Array
     """How far the functions are faded in."""
-    above: Array
+    parent_fade: Array
     """The same of the cluster above."""
 
 
@@ -423,11 +423,11 @@ def members_of(share: Array, cluster: int) -> Array:
 class Look(NamedTuple):
     """A cluster that is looked at."""
 
-    linear: float
+    linearity: float
     """How linear it sees the potential."""
-    crossing: float
+    wall_crossing_weight: float
     """How much it crosses a wall."""
-    stiff: float
+    screening_factor: float
     """Energy of its function before a plane at that distance, over that in free space."""
     size: float
     """Its length [m]."""

@@ -80,7 +80,7 @@ def test_panels_that_nearly_coincide(near: float, extra: float) -> None:
 
 
 def test_a_surface_that_meets_itself_is_refused() -> None:
-    with pytest.raises(SolveError, match="the surface of 2 panels meets itself"):
+    with pytest.raises(SolveError, match="the surface of 2 panels intersects itself"):
         rigid._made_definite(np.array([[1.0, 1.2], [1.2, 1.0]]))
 
 

@@ -42,7 +42,7 @@ class Film:
     """The flat sheets by their names."""
 
     def measured_in(self, unit: float) -> Film:
-        """The same film with lengths in a unit [m]."""
+        """This film with lengths in a unit [m]."""
         radius = float(measured(np.array([self.radius]), unit)[0])
         return Film(radius, {name: s.measured_in(unit) for name, s in self.sheets.items()})
 

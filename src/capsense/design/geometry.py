@@ -47,7 +47,7 @@ class Facet:
         return shapely.transform(self.polygon, lambda uv: self.to_sensor(uv)[:, :2])
 
     def measured_in(self, unit: float) -> Facet:
-        """The same facet with lengths in a unit [m]."""
+        """This facet with lengths in a unit [m]."""
         outline = shapely.transform(self.polygon, lambda uv: measured(uv, unit))
         return Facet(outline, measured(self.origin, unit), self.axes)
 
@@ -87,7 +87,7 @@ class Surface:
         return float(sum(f.polygon.area for f in self.facets))
 
     def measured_in(self, unit: float) -> Surface:
-        """The same sheet with lengths in a unit [m]."""
+        """This sheet with lengths in a unit [m]."""
         facets = tuple(facet.measured_in(unit) for facet in self.facets)
         return Surface(facets, measured(self.rims, unit))
 

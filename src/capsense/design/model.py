@@ -79,7 +79,7 @@ class Domain:
         return np.array([self.lower - beyond, self.upper + beyond])
 
     def measured_in(self, unit: float) -> Domain:
-        """The same domain with lengths in a unit [m]."""
+        """This domain with lengths in a unit [m]."""
         x, y, z, depth = measured(np.array([*self.size, self.backplane]), unit).tolist()
         return Domain((x, y, z), depth, self.open)
 
@@ -137,7 +137,7 @@ class Layer:
         return np.asarray(((points > self.lower) & (points < self.upper)).all(axis=-1))
 
     def measured_in(self, unit: float) -> Layer:
-        """The same part with lengths in a unit [m]."""
+        """This part with lengths in a unit [m]."""
         return replace(
             self, lower=measured(self.lower, unit), upper=measured(self.upper, unit),
             facets=tuple(facet.measured_in(unit) for facet in self.facets),
@@ -204,7 +204,7 @@ class Design:
 
     @cached_property
     def in_units(self) -> Design:
-        """The same design with all lengths in its :attr:`unit`."""
+        """This design with all lengths in its :attr:`unit`."""
         unit = self.unit
         if unit == 1.0:
             return self

@@ -155,7 +155,7 @@ def solid_angle(edges, normal, x, y, z):
 
 @kernel
 def _flux_mean(p, i, j, floor):
-    """The same mean as :func:`_mean_normal_gradient`, so that Gauss's law holds exactly.
+    """The mean of :func:`_mean_normal_gradient`, so that Gauss's law holds exactly.
 
     Panel i is met in closed form and panel j by quadrature: from any point of a closed surface the
     solid angles of its panels sum to 2π. Else matter of a high permittivity gains a charge.
@@ -189,7 +189,7 @@ def _panel_potential(p, j, x, y, z):
 
 @kernel
 def _imaged_potential(p, j, floor, x, y, z):
-    """The same with the image charge that the grounded plane z = ``floor`` is met by."""
+    """Potential of a panel and of its image in the grounded plane z = ``floor``."""
     return _panel_potential(p, j, x, y, z) - _panel_potential(p, j, x, y, 2.0 * floor - z)
 
 
@@ -330,7 +330,7 @@ def normal_gradient_matrix(rows: NDArray[np.int64], floor: float, panels: Panels
 def normal_gradient_block(
     rows: NDArray[np.int64], floor: float, panels: Panels, first: int
 ) -> Array:
-    """The same of the panels from ``first`` on."""
+    """Rows of :func:`normal_gradient_matrix`, for the panels from ``first`` on."""
     out = np.empty((len(rows), len(panels.centers) - first))
     return filled(_fill_normal_gradients, out, rows, first, floor, panels)
 

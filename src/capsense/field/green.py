@@ -260,7 +260,7 @@ def _weight(distances: Array) -> Array:
 
 
 def _near_weight(distances: Array) -> Array:
-    """The same of the near representation, (n, 1): near the design ψ·ψ is large."""
+    """Error of ψ·ψ of the near representation, (n, 1): near the design ψ·ψ is large."""
     return (distances**0.75 / (1 + distances / _MIDDLE))[:, None]
 
 

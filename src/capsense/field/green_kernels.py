@@ -150,7 +150,7 @@ class Green(NamedTuple):
     score_table: NDArray[Any]
     """φ⁰ alone, from the last of these, shape (f, lead)."""
     grid: Grid
-    """The same as a table over the domain, roughly."""
+    """φ⁰ as a table over the domain, to some per cent."""
     phi_columns: int
     """Columns of φ⁰, padded."""
     terminals: int

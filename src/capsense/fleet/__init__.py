@@ -195,7 +195,7 @@ class Fleet:
                 warnings.warn(
                     f"place {place}: {middle:.2g} m is wide for a body on Warp, which is cut into "
                     "few clusters: near the sensor readings are tens of per cent off. Compare with "
-                    'fleet.check(poses), or take device="cpu". This is said once',
+                    'fleet.check(poses), or take device="cpu". Further warnings are suppressed',
                     stacklevel=3,
                 )
                 return
@@ -339,7 +339,7 @@ class Fleet:
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *,
         forces: ArrayLike | None = None, jacobian: bool = False,
     ) -> FleetReading:  # fmt: skip
-        """The same as :meth:`step`, without chips and their time."""
+        """As :meth:`step`, without chips and their time."""
         if jacobian and self.table.lossy:
             raise SceneError(
                 "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "

@@ -225,7 +225,7 @@ class _Family:
     values: Array
     """Capacitance [F], shape (n, k)."""
     levels: Array
-    """The same with nothing in front of the sensor [F], shape (k,)."""
+    """Capacitances with nothing in front of the sensor [F], shape (k,)."""
 
 
 def plot(

@@ -140,7 +140,7 @@ class ReciprocalLaw:
             return self._product / np.asarray(code, dtype=float)
 
     def set_for(self, capacitance: float) -> ReciprocalLaw:
-        """The same with an MPR121's current and time that bring a capacitance [F] near 90 %.
+        """This law with an MPR121's current and time that bring a capacitance [F] near 90 %.
 
         Raises:
             ReadoutError: No setting brings it into the range.

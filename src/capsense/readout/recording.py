@@ -34,7 +34,7 @@ class CapacitanceRecord:
     """Capacitances [F] by column, each of shape (n,): ``C_E1_E2`` an entry of the Maxwell matrix,
     ``C_E1`` a self capacitance, ``Cm_E1_E2`` a mutual one."""
     empty: dict[str, float]
-    """The same with an empty scene [F]; holds nothing where the file does not."""
+    """Capacitances with an empty scene [F]; holds nothing where the file does not."""
     shields: bool = False
     """Whether the sensor is known to have driven shields."""
 

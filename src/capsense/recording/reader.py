@@ -41,7 +41,7 @@ class Step:
     time: float
     """Its time [s]; it starts anew in each episode."""
     stamp: int
-    """The same on the recording's clock, which never goes back [ns]."""
+    """Time on the recording's clock, which never goes back [ns]."""
     scene: Scene
     """What the simulator was given, to the last bit."""
     reading: Reading

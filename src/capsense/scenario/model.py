@@ -319,7 +319,7 @@ class Scenario:
         return Scene([b.at(time) for b in self.bodies])
 
     def resampled(self, sample_rate: float) -> Scenario:
-        """The same scenario at another sample rate [Hz].
+        """This scenario at another sample rate [Hz].
 
         Raises:
             ScenarioError: The rate is not positive, or makes too many samples.

@@ -234,7 +234,7 @@ class RestSurface(Frozen):
         return is_closed(self.faces, len(self.vertices))
 
     def measured_in(self, unit: float) -> RestSurface:
-        """The same with lengths in a unit [m]; the last one is kept."""
+        """This surface with lengths in a unit [m]; the last one is kept."""
         held: tuple[float, RestSurface] | None = self.__dict__.get("_measured")
         if held is None or held[0] != unit:
             rest = RestSurface(self.vertices / unit, self.faces, self.thickness / unit)

@@ -64,7 +64,7 @@ class Shape(Frozen, ABC):
         return (*self.params.tolist(), *self.bounds().mean(axis=0).tolist())
 
     def measured_in(self, unit: float) -> Self:
-        """The same shape with lengths in a unit [m]; the last one is kept."""
+        """This shape with lengths in a unit [m]; the last one is kept."""
         if unit == 1.0:
             return self
         held: tuple[float, Self] | None = self.__dict__.get("_measured")

@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 
 _OF_MANY = 0.4
 """Panels of one part of a large mesh, over those of a body."""
-_NO_SOLUTION = "the charges of the bodies cannot be told apart; look for bodies that coincide"
+_NO_SOLUTION = "the system matrix is singular; do two bodies coincide?"
 _LARGE = 0.4
 """Meshes that are longer than this [m] are solved for part by part."""
 _LAYOUTS = 32

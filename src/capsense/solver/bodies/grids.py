@@ -294,7 +294,7 @@ def _quads(*corners: Array) -> Array:
 
 
 def _turned(polygons: Array) -> Array:
-    """The same polygons with the other winding, repeated corners last."""
+    """Polygons with the other winding, repeated corners last."""
     triangle = (polygons[:, 2] == polygons[:, 3]).all(axis=1)
     order = np.where(triangle[:, None], [1, 0, 2, 3], [3, 2, 1, 0])
     return np.take_along_axis(polygons, order[:, :, None], axis=1)

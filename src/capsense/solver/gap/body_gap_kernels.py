@@ -38,7 +38,7 @@ from capsense.solver.bodies.outline import (
 SHARE = 0.1
 """Length by which bodies are held apart, over the second-largest extent of the smaller one."""
 PANEL = 0.4
-"""The same, over the larger panels of the two, at least."""
+"""Least of these lengths, over the larger panels of the two."""
 CLUSTER = 4.0, 6.0
 """Extents of clusters, over that length, at which they come to be split, and are."""
 REACH = 2.5, 3.0

@@ -122,7 +122,7 @@ def eigen(matrix: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 @compiled
 def _product(left: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
-    """``left @ right``, with the same bits however many threads a BLAS has."""
+    """``left @ right``, bit-identical for any number of threads."""
     out = np.zeros((left.shape[0], right.shape[1]))
     for i in range(left.shape[0]):
         for k in range(left.shape[1]):

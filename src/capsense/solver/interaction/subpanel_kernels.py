@@ -37,7 +37,8 @@ def add_parts(bodies, cut, leaves, out):
 
 @compiled
 def _add_of_body(body, cut, leaves, span, out):
-    """The same of the leaves of one body: its first, the first that is a part, the one behind."""
+    """Add what subpanels meet in one body, given by its leaves: its first, the first that is a
+    part, the one behind."""
     start, first, stop = span
     factor = np.float32(1.0 + body.inside * body.inverse_susceptibility)
     group, weight, groups = _panels(body, cut, (first, stop))

@@ -41,7 +41,7 @@ class ActiveClusters(NamedTuple):
     points: NDArray[Any]
     """Four points of each [m], shape (l, 4, 3)."""
     true: NDArray[Any]
-    """The same before they were lifted off the design."""
+    """Four points of each before they are lifted off the design [m], shape (l, 4, 3)."""
     extent: NDArray[Any]
     """Extents [m], shape (l,)."""
     softening_length: NDArray[Any]
@@ -73,7 +73,8 @@ def placed(bodies, cut, green):
 
 @kernel
 def _fill_leaves(bodies, cut, green, leaves, room):
-    """The same; ``room`` is room to work in: two matrices and a vector of three."""
+    """Fill the clusters of :func:`placed`; ``room`` is workspace: two matrices and a vector of
+    three."""
     moments, turn, middle = room
     space = green.space
     for j in range(cut.active.shape[0]):
@@ -254,7 +255,8 @@ def _cross(x, y, u, v):
 
 @kernel
 def near_pairs(points, others, soft, i, own, weight, near, line):
-    """The same for clusters without weight, point by point, but those from own[0] to own[1].
+    """Add force and torque on cluster i by clusters without weight, point by point, but those from
+    own[0] to own[1].
 
     ``near`` (14, l) is room for their points, bounds and numbers; ``line`` has shape (6, l).
     """

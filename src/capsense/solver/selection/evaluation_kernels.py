@@ -84,7 +84,7 @@ def room_for(count, phi_columns):
 
 @compiled
 def with_room(looks, filled, more):
-    """The same, with room for some more behind the rows that are filled.
+    """A copy with room for some more behind the rows that are filled.
 
     Room for all clusters of a scene may take a hundred megabytes, which the system would hand out
     anew at each step.
@@ -184,7 +184,8 @@ def look(body, green, coarser, looks, start):
 
 @kernel
 def _look_into(body, green, coarser, looks, start, wanted):
-    """The same but for potentials, which are wanted at points, in rows, times a part of each.
+    """Evaluate clusters but for potentials, which are wanted at points, in rows, times a part of
+    each.
 
     Returns:
         The row behind the last one that was filled, and how many points there are.

@@ -41,7 +41,7 @@ class ActiveTree(NamedTuple):
     fade: NDArray[Any]
     """How far its function is faded in, 0 to 1, shape (k,)."""
     parent_fade: NDArray[Any]
-    """The same of the cluster above, 1 at the top, shape (k,)."""
+    """Fade of the cluster above, 1 at the top, shape (k,)."""
     inside_weight: NDArray[Any]
     """How far something of it within reach is represented, 0 to 1, shape (k,)."""
     active: NDArray[Any]
@@ -60,7 +60,7 @@ class Functions(NamedTuple):
     fade: NDArray[Any]
     """How far it is faded in, 0 to 1, shape (f,)."""
     parent_fade: NDArray[Any]
-    """The same of the function above, 1 at the top, shape (f,)."""
+    """Fade of the function above, 1 at the top, shape (f,)."""
     panel_end_fraction: NDArray[Any]
     """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,); 0 where
     something of the cluster is out of reach."""
@@ -91,7 +91,7 @@ class _Queue(NamedTuple):
 
 @compiled
 def _with_room(queue, filled, more):
-    """The same, with room for some more behind those that are filled; as :func:`with_room`."""
+    """A copy with room for some more behind those that are filled; as :func:`with_room`."""
     if filled + more <= queue.body.shape[0]:
         return queue
     n = 2 * filled + more

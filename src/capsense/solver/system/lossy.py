@@ -17,7 +17,7 @@ from capsense.solver.system.system_kernels import COARSE, GAIN, factorise, leaf_
 
 
 def _product(left: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
-    """``left @ right``, with the same bits however many threads a BLAS has."""
+    """``left @ right``, bit-identical for any number of threads."""
     return np.einsum("ij,jk->ik", left, right)
 
 

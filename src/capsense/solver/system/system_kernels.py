@@ -62,7 +62,7 @@ class System(NamedTuple):
     matrix: NDArray[Any]
     """Energies of those solved for [1/m], shape (n, n)."""
     rest: NDArray[Any]
-    """The same of the others with those, shape (f - n, n)."""
+    """Energies of the functions outside the system with those in it, shape (f - n, n)."""
     diagonal: NDArray[Any]
     """Energies of all functions by themselves [1/m], shape (f,)."""
 

@@ -156,7 +156,7 @@ def wide_body(shape: Shape, pieces: int, conducting: bool) -> FinePanelBody:
 
 
 def _ahead(tree: Clusters, parts: Array, count: int) -> Clusters:
-    """The same clusters, those first that are split to get ``count`` with equal sums of parts.
+    """Reorder clusters: those come first that are split to get ``count`` with equal sums of parts.
 
     Args:
         tree: Clusters, breadth first.

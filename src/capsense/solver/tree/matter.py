@@ -144,7 +144,7 @@ class Matter:
         return _grouped(self, tuple(group.tolist()))
 
     def repeated(self, places: Sequence[int]) -> Matter:
-        """The same for parts of bodies; those of one conductor share its net charge.
+        """Matter of parts of bodies; those of one conductor share its net charge.
 
         Args:
             places: Body of each part, ascending.
@@ -249,7 +249,8 @@ def _axis(body: Body) -> tuple[Array, float] | None:
 
 
 def _axes(packed: PackedScene, chosen: NDArray[np.intp]) -> tuple[Array, Array]:
-    """The same of bodies of a scene, (n, 2, 3) and (n,); the radius of other shapes is nan."""
+    """Bounding boxes and radii of bodies of a scene, (n, 2, 3) and (n,); the radius of other shapes
+    is nan."""
     kinds, (radius, half, _) = packed.kinds[chosen], packed.params[chosen].T
     capsule = kinds == ShapeKind.CAPSULE
     arm = np.where(capsule, half, 0.0)[:, None] * packed.rotation[chosen, :, 2]

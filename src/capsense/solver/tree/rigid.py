@@ -263,7 +263,7 @@ def _conjugate_gradients(matrix: Array, residual: Array, x: Array, left: float) 
 
 
 def _made_definite(free: Array) -> Array:
-    """The same where the diagonal may have to be raised first, in place."""
+    """Solve where the diagonal may have to be raised first, in place."""
     own = np.diag(free).copy()
     for extra in _EXTRA:
         np.fill_diagonal(free, (1.0 + extra) * own)
@@ -273,7 +273,7 @@ def _made_definite(free: Array) -> Array:
             break
     else:
         raise SolveError(
-            f"the surface of {len(free)} panels meets itself, so that no charge can be told; "
+            f"the surface of {len(free)} panels intersects itself: the matrix of its panels is not positive definite; "
             "remove doubled faces"
         )
     sides = np.ones((len(free), 8))

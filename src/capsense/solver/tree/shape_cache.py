@@ -100,7 +100,7 @@ _log = logging.getLogger(__name__)
 _KEPT = 512_000_000
 """Shapes are forgotten, the longest unused first, when they take up more than this [bytes]."""
 _FILES = 1_000_000_000
-"""The same of files [bytes], the oldest first."""
+"""Most bytes of files; the oldest are removed first."""
 _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
 _LEAST = 1e-9
@@ -186,7 +186,7 @@ def _conductor_of(whole: Shape, count: int, _: str) -> RigidShape:
 
 
 def in_pieces(shape: Shape, count: int, conducting: bool) -> tuple[DynamicBody, float]:
-    """The same of a wide shape, of so many pieces without energies of their own."""
+    """A wide shape of so many panels, without potential coefficients of its own."""
 
     def make(whole: Shape, count: int, name: str) -> FinePanelBody:
         made = wide_body(whole, count, conducting)
