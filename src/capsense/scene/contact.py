@@ -181,8 +181,8 @@ def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array], touch: float)
         warnings.warn(
             f"{found.electrodes} {how} {listed(found.bodies, 4)}{deep} and readings mean nothing "
             f"until this ends; keep bodies at least {1e3 * touch:.2g} mm in front of the "
-            "electrodes. Further warnings are suppressed; reading.stats.solver_error then is as large as the "
-            "largest capacitance",
+            "electrodes. Further warnings are suppressed; reading.stats.solver_error then is as "
+            "large as the largest capacitance",
             stacklevel=4,
         )
 
@@ -207,8 +207,8 @@ def warn_of_doubt(scene: Scene, electrode: tuple[str, Array], share: float, reas
     far = f", {1e3 * max(near[what], 0.0):.2g} mm away," if near else ""
     warnings.warn(
         f"the estimated error of electrode {name} is {share:.0%} of what {what}{far} changes"
-        f'{reason and ": " + reason}; move it away, or take preset "fine". Further warnings are suppressed; '
-        "reading.stats.solver_error has the estimate",
+        f'{reason and ": " + reason}; move it away, or take preset "fine". '
+        "Further warnings are suppressed; reading.stats.solver_error has the estimate",
         stacklevel=4,
     )
 

@@ -273,8 +273,8 @@ def _made_definite(free: Array) -> Array:
             break
     else:
         raise SolveError(
-            f"the surface of {len(free)} panels intersects itself: the matrix of its panels is not positive definite; "
-            "remove doubled faces"
+            f"the surface of {len(free)} panels intersects itself: the matrix of its panels is not "
+            "positive definite; remove doubled faces"
         )
     sides = np.ones((len(free), 8))
     substitute(factor, sides)
