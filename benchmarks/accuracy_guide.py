@@ -33,7 +33,7 @@ GAPS = {
     "50 to 150 mm": 9.0,
 }  # fmt: skip
 """Column → largest gap [m]."""
-PRESETS = ("learning", "standard", "fine")
+PRESETS = ("fast", "standard", "fine")
 MARKERS = ("<!-- errors -->", "<!-- end of errors -->")
 
 

@@ -1,7 +1,7 @@
 """Errors of ΔC against boundary elements over a map of scenes, and what a step costs.
 
     python benchmarks/accuracy_map.py                           # the default method and preset
-    python benchmarks/accuracy_map.py --presets learning standard fine -o out/accuracy_time.png
+    python benchmarks/accuracy_map.py --presets fast standard fine -o out/accuracy_time.png
     python benchmarks/accuracy_map.py --method fem_masked --worst 0
     python benchmarks/accuracy_map.py --settings refine=1.5
 

@@ -37,7 +37,7 @@ from capsense.field.panels import Panels
 Array = NDArray[np.float64]
 DESIGN, ELECTRODE = "arm_segment", 1
 RADII, GAPS = (0.020, 0.006), (0.1e-3, 0.3e-3, 0.5e-3, 1e-3, 2e-3, 3e-3, 5e-3, 10e-3)
-PRESETS = "learning", "standard", "fine"
+PRESETS = "fast", "standard", "fine"
 FINEST, COARSE = 2.5e-4, 0.4
 """Panels near where a ball is nearest: least size [m], and size over their distance from it."""
 ROUND = 1 / 8000

@@ -161,7 +161,7 @@ def main() -> int:
     scenes = [
         s for s in reference_scenes() if all(isinstance(b.shape, PRIMITIVES) for b in s.scene)
     ]
-    name, values = ("preset", ["learning", "standard"])
+    name, values = ("preset", ["fast", "standard"])
     if options.device != "cpu":
         name, values = ("budget", [32, 64, 128])
     told = "rms, worst error [%]: one body from 15 mm on, all scenes"

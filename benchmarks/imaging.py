@@ -41,8 +41,7 @@ def main() -> None:
     count = len(sim.electrode_names)
     pairs = electrode_pairs(count, diagonal=True)
     nodes = np.stack(np.meshgrid(*GRID, indexing="ij"), axis=-1)
-    sim.step(cs.Scene())
-    potentials = sim.potentials(nodes.reshape(-1, 3))[:, :count]
+    potentials = sim.step(cs.Scene(), keep_field=True).potentials(nodes.reshape(-1, 3))[:, :count]
     j = grounded_sensitivity(potentials.reshape(*nodes.shape[:3], count), GRID, pairs)
     rng = np.random.default_rng(1)
     places = rng.uniform((-0.045, -0.035, 0.035), (0.045, 0.035, 0.08), (COUNT, 3))

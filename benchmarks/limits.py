@@ -46,7 +46,7 @@ NEAR = 0.002
 """Gaps up to this are near contact [m]."""
 STEP = 5e-5
 """A step towards the sensor [m]."""
-PRESETS: tuple[PresetName, ...] = ("learning", "standard", "fine")
+PRESETS: tuple[PresetName, ...] = ("fast", "standard", "fine")
 BODIES: dict[str, tuple[cs.Shape, tuple[float, float, float]]] = {
     "ball of 20 mm radius": (cs.Sphere(0.02), (0, 0, 0)),
     "finger": (cs.Capsule(0.008, 0.06), (0.4, 0.6, 0)),
@@ -252,14 +252,14 @@ def skin(_: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
 
 
 PARTS = {
-    "contact, presets learning, standard, fine, and 2,800 panels": contact,
+    "contact, presets fast, standard, fine, and 2,800 panels": contact,
     "near limbs: gaps of 1, 2, 5, 10 mm, each preset": limbs,
     "wide boxes: median and largest error, and median estimate, of each preset": wide,
     "narrow electrodes: gaps of 2, 5, 10, 30 mm": narrow,
     "falls in a step: 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, of each preset": falls,
     "growth in a step of 0.05 mm at 5, 2, 1, 0.5 mm, standard and many pieces": growth,
-    "a person's arm: rms and largest error, presets learning and standard": person,
-    "a figure of one skin: presets learning, standard, fine": skin,
+    "a person's arm: rms and largest error, presets fast and standard": person,
+    "a figure of one skin: presets fast, standard, fine": skin,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
     "deforming sheets of dielectrics, gaps of 5, 10, 20, 50 mm": cloth,
     "in the sensor: error estimate with lowest points at 1, 0, -1, -5 mm": inside,

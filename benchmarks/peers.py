@@ -108,7 +108,7 @@ def groups(folder: Path) -> dict[str, Callable[[], Makers]]:
         "1M": lambda: on_mesh(0.48, folder, ("pardiso", "jacobi", "ngsolve")),
         "2M": lambda: on_mesh(0.38, folder, ("jacobi", "ngsolve")),
         "remeshed": lambda: {"capsense": CapSense, "ngsolve": NgSolveRemeshed},
-        "learning": lambda: {"capsense": lambda: CapSense("learning")},
+        "fast": lambda: {"capsense": lambda: CapSense("fast")},
         "fine": lambda: {"capsense": lambda: CapSense("fine")},
     }  # fmt: skip
 

@@ -276,7 +276,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--presets", nargs="+", default=["learning", "standard", "fine"])
+    parser.add_argument("--presets", nargs="+", default=["fast", "standard", "fine"])
     parser.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="figures as JSON")
     args = parser.parse_args()

@@ -128,7 +128,7 @@ def controllers(made: dict[str, Array]) -> dict[str, Callable[[float], Estimator
     The simpler models are also scaled by one factor, to be right 5 cm over a limb of middling
     size, as one measures it in a laboratory.
     """
-    sim = cs.Simulator("six_patch", preset="learning")
+    sim = cs.Simulator("six_patch", preset="fast")
     options: dict[str, Any] = {"noise": NOISE, "relative": GAIN}
     usual = PoseEstimator(sim).scene(LimbPose(vertical=0.05), Belief().radius)
     right = sim.step(usual).delta.trace()

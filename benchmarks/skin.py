@@ -54,7 +54,13 @@ class World:
     def skin(self, threads: int) -> object:
         """The sixteen sensors."""
         return cs.mujoco.attach_skin(
-            self.model, self.data, SITES, materials=MATERIALS, grounding=GROUNDING, threads=threads
+            self.model,
+            self.data,
+            SITES,
+            "arm_segment",
+            materials=MATERIALS,
+            grounding=GROUNDING,
+            threads=threads,
         )
 
 

@@ -1,6 +1,6 @@
 """What a step costs on one core, by world and preset; batches, set-up, the first reading.
 
-    python benchmarks/steps.py [--presets standard learning fine] [--steps 200] [-o out/steps.json]
+    python benchmarks/steps.py [--presets standard fast fine] [--steps 200] [-o out/steps.json]
     python benchmarks/steps.py --only finger --no-set-up
 
 The worlds are those of ``step_scenes.py``, in front of ``six_patch``. Times are the processor's,
@@ -36,13 +36,13 @@ from step_scenes import DESIGN, FINGER, World, low, random_scenes, worlds
 
 import capsense as cs
 
-PRESETS = ("standard", "learning", "fine")
+PRESETS = ("standard", "fast", "fine")
 TURNS, WARM_UP = 5, 3
 MASKED_STEPS = 20
 BATCH, ROUNDS, THREADS = 256, 5, 2
-ONE_BODY = {"learning": 0.12}
+ONE_BODY = {"fast": 0.12}
 """Median that one body is meant to take [ms], where it is not the standard preset's."""
-BATCH_TARGETS = {"standard": 4000, "learning": 15000}
+BATCH_TARGETS = {"standard": 4000, "fast": 15000}
 """Scenes a second."""
 SHAPES: dict[str, Callable[[float], cs.Shape]] = {
     "sphere of a new size": lambda v: cs.Sphere(0.03 * v),

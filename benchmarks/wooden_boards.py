@@ -36,7 +36,7 @@ def main() -> None:
     scales = (1.0,) if parser.parse_args().coarse else (1.0, 0.8)
     design, wood = cs.load_design("six_patch"), cs.MATERIALS["wood"]
     empty = {scale: diagonal(design, scale) for scale in scales}
-    sims = {p: cs.Simulator("six_patch", preset=p) for p in ("learning", "standard", "fine")}
+    sims = {p: cs.Simulator("six_patch", preset=p) for p in ("fast", "standard", "fine")}
     for size in SIZES:
         for gap in GAPS:
             low = np.append(MIDDLE - np.array(size[:2]) / 2, gap)

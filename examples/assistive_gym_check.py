@@ -61,11 +61,11 @@ def main() -> None:
     ride(env, wrist, "the person's right wrist")
     env.reset()
     ride(env, tool, "Jaco's tool, after a reset")
-    fast = cs.Simulator("six_patch", preset="learning")
+    fast = cs.Simulator("six_patch", preset="fast")
     place = cs.Pose((0, 0, 0.05))
     bare = ["tool", "*finger*", "furniture"]
     for name, design, exclude, materials in (
-        ("preset learning", fast, bare[:2], {"furniture": "wood"}),
+        ("preset fast", fast, bare[:2], {"furniture": "wood"}),
         ("without the bed", "six_patch", bare, None),
     ):
         options = {"pose_in_link": place, "exclude": exclude, "materials": materials}

@@ -90,7 +90,9 @@ def story(feels: bool) -> Record:
     data.ctrl[:] = data.qpos
     mujoco.mj_forward(model, data)
 
-    skin = cs.mujoco.attach_skin(model, data, SITES, materials=MATERIALS, grounding=GROUNDING)
+    skin = cs.mujoco.attach_skin(
+        model, data, SITES, "arm_segment", materials=MATERIALS, grounding=GROUNDING
+    )
     away = {name: reading.delta for name, reading in skin.read().items()}  # nobody is near yet
     record = Record()
     stride = round(1 / (RATE * model.opt.timestep))

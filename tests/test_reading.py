@@ -19,7 +19,7 @@ def test_mutual_capacitances_are_positive() -> None:
     assert (mutual[off] > 0).all()
     assert not np.diag(mutual).any()
     assert (np.diag(reading.capacitance) > 0).all()
-    assert "_shield_coupling" not in repr(reading)
+    assert "shield_coupling" not in repr(reading)
 
 
 def test_shields_take_charge_away() -> None:

@@ -78,13 +78,13 @@ def test_grounded_bar_nearly_touching(simulators, gap, bound):
 def test_grounded_bar_nearly_touching_with_few_functions(simulators, gap):
     """Measured against boundary elements: 23 % of each diagonal at 1 mm, 16 % at 2 mm."""
     known = simulators("six_patch_bare")
-    sim = cs.Simulator("six_patch_bare", preset="learning", background=known.background)
+    sim = cs.Simulator("six_patch_bare", preset="fast", background=known.background)
     found = np.diag(sim.step(cs.Scene([body_of(f"bar {gap}")])).delta)
     truth = np.diag(delta_reference("six_patch_bare", f"bar {gap}"))
     np.testing.assert_allclose(found, truth, rtol=0.25 if gap == 1 else 0.18)
 
 
-@pytest.mark.parametrize("preset", ["learning", "standard"])
+@pytest.mark.parametrize("preset", ["fast", "standard"])
 @pytest.mark.parametrize("size", [(0.15, 0.15, 0.02), (0.3, 0.25, 0.05), (0.06, 0.2, 0.1)])
 def test_wide_boxes_near_contact_read_less_than_plates(simulators, preset, size):
     """Invariant: from 1 to 0.3 mm no electrode has more than a plate as wide as it would."""
@@ -162,9 +162,7 @@ def test_patches_far_from_the_floor(simulators, case):
     check(sim, "six_patch_midcube", case, diagonal, 0.05)
 
 
-@pytest.mark.parametrize(
-    ("preset", "rms", "worst"), [("learning", 8.0, 18.0), ("standard", 2.0, 4.0)]
-)
+@pytest.mark.parametrize(("preset", "rms", "worst"), [("fast", 8.0, 18.0), ("standard", 2.0, 4.0)])
 def test_a_persons_arm_that_leaves_the_box(simulators, preset, rms, worst):
     """Against the preset fine [%]: a hand that hardly counts must not spoil what the forearm does.
 

@@ -11,7 +11,7 @@ from random_scenes import random_scene
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
-from capsense.errors import BatchError, SceneError, SolveError
+from capsense.errors import BatchError, SolveError
 from capsense.field.background import Change
 from capsense.masked import MaskedScenes
 from capsense.solver import surface_solver as solver
@@ -170,7 +170,7 @@ def test_scenes_as_they_come(tiny: cs.Simulator) -> None:
 def test_refused_before_any_work(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
     """By name, with the fix."""
     monkeypatch.setattr(SurfaceSolver, "look", lambda *_: pytest.fail("worked"))
-    with pytest.raises(SceneError, match=r"scenes\[2\]: a batch holds a Scene .*, not list"):
+    with pytest.raises(TypeError, match=r"scenes\[2\]: a batch holds a Scene .*, not list"):
         tiny.step_batch([cs.Scene(), cs.Scene(), []])  # type: ignore[list-item]
-    with pytest.raises(SceneError, match="threads is 0"):
+    with pytest.raises(ValueError, match="threads is 0"):
         tiny.step_batch([cs.Scene()], threads=0)

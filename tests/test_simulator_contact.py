@@ -45,7 +45,7 @@ def _over_pad(shape: cs.Shape, height: float, grounding="grounded") -> cs.Scene:
 @pytest.mark.parametrize(
     "name", ["6pb ball10 g0.3", "6pb ball10 g1", "6pb needle r.5 L40 vertical g1"]
 )
-@pytest.mark.parametrize(("preset", "bound"), [("learning", 0.1), ("standard", 0.02)])
+@pytest.mark.parametrize(("preset", "bound"), [("fast", 0.1), ("standard", 0.02)])
 def test_near_references(name, preset, bound, simulators):
     """Differential: boundary elements of sensor and body together, to 1 %."""
     delta = 1e15 * simulators("six_patch_bare", preset=preset).step(_scene(MAP[name])).delta
@@ -64,7 +64,7 @@ def test_a_plate_on_a_pad_is_a_plate_capacitor(gap, simulators):
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("preset", ["learning", "standard", "fine"])
+@pytest.mark.parametrize("preset", ["fast", "standard", "fine"])
 @pytest.mark.parametrize(
     ("shape", "half"),
     [

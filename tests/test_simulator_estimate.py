@@ -152,7 +152,7 @@ def test_an_electrode_inside_a_body_cannot_be_trusted(
     assert doubted == (of_steel if material == "steel" else of_wood)
 
 
-@pytest.mark.parametrize("preset", ["learning", "standard"])
+@pytest.mark.parametrize("preset", ["fast", "standard"])
 @pytest.mark.parametrize("size", [(1.0, 0.6, 0.02), (2.0, 2.0, 0.1)])
 def test_of_tables_and_floors(
     simulators: Callable[..., cs.Simulator], preset: str, size: tuple[float, float, float]

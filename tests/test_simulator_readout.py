@@ -71,7 +71,7 @@ def test_counts_are_those_of_the_chip(make: Make, method: str, times: np.ndarray
 
 
 def test_copies_go_on(make: Make) -> None:
-    """A pickled sensor reports what the original does; copies and batches have no chip."""
+    """A pickled sensor reports what the original does; copies have no chip."""
     sim = make(readout="fdc1004")
     for t in TIMES[:5]:
         sim.step(scene_at(t), time=t)
@@ -79,9 +79,61 @@ def test_copies_go_on(make: Make) -> None:
     rest = [[s.step(scene_at(t), time=t).counts for t in TIMES[5:]] for s in (sim, twin)]
     assert same(*rest)
     assert sim.copy().readout is None
-    assert all(r.counts is None for r in sim.step_batch([scene_at(t) for t in TIMES]))
     sim.use_readout(None)
+    assert all(r.counts is None for r in sim.step_batch([scene_at(t) for t in TIMES]))
     assert sim.step(scene_at(0.0)).counts is None
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_batches(make: Make, threads: int) -> None:
+    """Differential: a chip is told the scenes of a batch as it is those of steps; it goes on."""
+    sim, plain = make(readout="fdc1004"), make()
+    expected, scenes = by_hand(plain), [scene_at(t) for t in TIMES]
+    first = [sim.step(scene_at(t), time=t).counts for t in TIMES[:4]]
+    many = sim.step_batch(scenes[4:9], times=TIMES[4:9], threads=threads)
+    rest = sim.step_batch(iter(scenes[9:]), times=TIMES[9:].tolist(), threads=threads)
+    assert same(first + [r.counts for r in (*many, *rest)], expected)
+    for reading, scene in zip(many, scenes[4:9], strict=True):
+        np.testing.assert_array_equal(reading.delta, plain.step(scene).delta)
+    assert sim.step_batch([], times=[]) == []
+    assert all(r.counts is None for r in sim.solved_batch(scenes[:2]))
+
+
+def test_batches_are_refused(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without times, with others than there are scenes, or going back: before anything is solved,
+    and with the chip as it was."""
+    sim, scenes = make(readout="fdc1004"), [scene_at(t) for t in TIMES[:3]]
+    sim.step(scenes[0], time=1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(sim, "solved_batch", lambda *_, **__: pytest.fail("solved"))
+        with pytest.raises(ReadoutError, match=r"write step_batch\(scenes, times=\[…\]\)"):
+            sim.step_batch(scenes)
+        with pytest.raises(ValueError, match="2 times for 3 scenes; give one for each"):
+            sim.step_batch(scenes, times=[1.0, 2.0])
+        for times in ([0.5, 1.0, 1.5], [1.1, 1.3, 1.2], [1.1, np.nan, 1.2], [1.1, "2", 1.2]):
+            with pytest.raises(ReadoutError, match=r"time must not go back|give a finite time"):
+                sim.step_batch(scenes, times=times)
+    twin = pickle.loads(pickle.dumps(sim))
+    found = sim.step_batch(scenes, times=[1.1, 1.2, 1.3])
+    expected = [twin.step(s, time=t).counts for s, t in zip(scenes, (1.1, 1.2, 1.3), strict=True)]
+    assert same([r.counts for r in found], expected)
+
+
+def test_a_failed_batch_leaves_the_chip_alone(make: Make) -> None:
+    """It can be given again, without the scenes that failed."""
+    sim, good = make(readout="fdc1004"), [scene_at(t) for t in TIMES[:4]]
+    twin = pickle.loads(pickle.dumps(sim))
+    wrong = cs.DepthFrame(np.full((16, 16), 0.02), 10.0, cs.OrthographicCamera(0.1))
+
+    def fail() -> cs.Scene:
+        raise cs.SceneError("nothing there")
+
+    object.__setattr__(wrong, "scene", fail)
+    with pytest.raises(cs.BatchError, match="nothing there"):
+        sim.step_batch([*good, wrong], times=[0.0, 0.1, 0.2, 0.3, 0.4], threads=1)
+    times = [0.0, 0.1, 0.2, 0.3]
+    found = [r.counts for r in sim.step_batch(good, times=times)]
+    assert same(found, [r.counts for r in twin.step_batch(good, times=times)])
 
 
 def test_refused(make: Make, tmp_path: Path) -> None:
@@ -124,7 +176,8 @@ def test_recorded(make: Make, tmp_path: Path) -> None:
 
 
 def test_attached(make: Make) -> None:
-    """A sensor on a robot takes the simulator's chip over; one of its own comes first."""
+    """A sensor on a robot has a copy of the simulator's chip, or one of its own; the simulator's
+    stays, and goes on as if there were no sensor."""
     mujoco = pytest.importorskip("mujoco", reason='needs pip install "capsense[mujoco]"')
     model = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><site name='s'/></worldbody></mujoco>"
@@ -133,13 +186,28 @@ def test_attached(make: Make) -> None:
     mujoco.mj_forward(model, data)
     sim = make(readout="fdc1004")
     sensor = cs.mujoco.attach(model, data, site="s", design=sim)
-    assert sim.readout is None
+    chip, twin = sim.readout, pickle.loads(pickle.dumps(sim))
+    assert chip is not None
+    assert sensor.readout is not chip
+    sim.step(cs.Scene(), time=5.0)
     sensor.read(0.0)
     assert len(sensor.read(0.1).counts) > 10
-    sim.use_readout("fdc1004")
     other = cs.mujoco.attach(model, data, site="s", design=sim, readout="mpr121")
     assert "mpr121" in repr(other.readout).lower()
-    assert sim.step(cs.Scene()).counts is None
+    bare = cs.mujoco.attach(model, data, site="s", design=sim)
+    bare.use_readout(None)
+    skin = cs.mujoco.attach_skin(model, data, ["s"], sim)
+    assert skin.sensors["s"].readout is not chip
+    for each in (sensor, other, bare):
+        each.reset(seed=4)
+        each.check()
+    skin.reset(seed=5)
+    assert bare.read(0.0).counts is None
+    assert sim.readout is chip
+    assert chip.seed == 0
+    twin.step(cs.Scene(), time=5.0)
+    expected = [twin.step(scene_at(t), time=5.0 + t).counts for t in TIMES]
+    assert same([sim.step(scene_at(t), time=5.0 + t).counts for t in TIMES], expected)
 
 
 def test_a_lossy_body_turns_the_phase_that_a_demodulating_chip_sees(make: Make) -> None:

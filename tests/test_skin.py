@@ -10,6 +10,7 @@ from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
 from capsense.errors import FieldError, SceneError, SkinError
+from capsense.readout import SEED_STRIDE
 from capsense.skin import make_simulators
 
 Array = np.ndarray
@@ -122,22 +123,30 @@ def test_sensors_of_one_design_share_its_field(tiny: cs.Simulator) -> None:
     assert made["b"].steps == 0
 
 
-def test_a_failing_sensor_does_not_lose_the_others(tiny: cs.Simulator) -> None:
+def test_a_failing_sensor_does_not_lose_the_others(
+    tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The error names it and holds the readings of the others."""
     skin = skin_of(tiny)
     good = scenes(1)[0]
-    views: dict[str, object] = dict(skin.views(good))
-    views["middle"] = "no scene"
-    with pytest.raises(SkinError, match=r"1 of 4 sensors failed; 'middle': step takes") as caught:
-        skin.step_views(views)  # type: ignore[arg-type]
-    assert list(caught.value.readings) == ["left", "right", "far"]
+    views = skin.views(good)
+
+    def fail(*_: object, **__: object) -> cs.Reading:
+        raise SceneError("nothing to see")
+
+    for name in ("middle", "right"):
+        monkeypatch.setattr(skin.simulators[name], "step", fail)
+    only = {name: view for name, view in views.items() if name != "right"}
+    with pytest.raises(SkinError, match=r"1 of 3 sensors failed; 'middle': nothing") as caught:
+        skin.step_views(only)
+    assert list(caught.value.readings) == ["left", "far"]
     assert list(caught.value.failures) == ["middle"]
     assert isinstance(caught.value.failures["middle"], SceneError)
     expected = tiny.copy().step(skin.views(good)["left"])
     assert same(caught.value.readings["left"], expected)
-    views["right"] = None
     with pytest.raises(SkinError, match=r"2 of 4 sensors failed; 'middle': .*so did 'right'"):
-        skin.step_views(views)  # type: ignore[arg-type]
+        skin.step_views(views)
+    monkeypatch.undo()
     assert set(skin.step(good)) == set(POSES), "and the next step is sound"
 
 
@@ -148,18 +157,61 @@ def test_refused(tiny: cs.Simulator) -> None:
     with pytest.raises(SceneError, match="give at least one"):
         cs.Skin({})
     for wrong in (3, [("a", cs.Pose())], "six_patch"):
-        with pytest.raises(SceneError, match=r"sensors is .*; give a dict such as"):
+        with pytest.raises(TypeError, match=r"sensors is .*; give a dict such as"):
             cs.Skin(wrong)
-    with pytest.raises(SceneError, match=r"sensor 'a' is .*give a pair \(design, Pose"):
+    with pytest.raises(TypeError, match=r"sensor 'a' is .*give a pair \(design, Pose"):
         cs.Skin({"a": "six_patch"})  # type: ignore[dict-item]
-    with pytest.raises(SceneError, match="threads is 0"):
+    with pytest.raises(ValueError, match="threads is 0"):
         skin_of(tiny, threads=0)
     with pytest.raises(SceneError, match=r"poses: no sensor is named 'lefd'.*'left'"):
         skin.step(cs.Scene([ball]), {"lefd": cs.Pose()})
     with pytest.raises(SceneError, match="views: no sensor is named"):
         skin.step_views({"elsewhere": cs.Scene()})
-    with pytest.raises(SceneError, match=r"write Scene\(\[...\]\)"):
+    with pytest.raises(TypeError, match=r"write Scene\(\[...\]\)"):
         skin.step([ball])  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"views\['left'\]: step takes a Scene .*, not list"):
+        skin.step_views({"left": []})  # type: ignore[dict-item]
+
+
+def test_every_sensor_has_a_chip_of_its_own(tiny: cs.Simulator) -> None:
+    """Differential: against simulators with chips of the seeds that the manual tells."""
+    skin, alone = skin_of(tiny), {name: tiny.copy() for name in POSES}
+    given = cs.Readout.preset("teensy", tiny.electrode_names, seed=3)
+    for choice, first in ((given, 3), ("teensy", 0)):
+        for start, seed in ((None, None), (2.0, 7)):
+            skin.use_readout(choice, start=start, seed=seed)
+            for _ in range(2):
+                for number, sim in enumerate(alone.values()):
+                    own = (first if seed is None else seed) + number * SEED_STRIDE
+                    sim.use_readout("teensy", start=start, seed=own)
+                for k, scene in enumerate(scenes(4)):
+                    time = (start or 0.0) + 0.02 * k
+                    found = skin.step(scene, time=time)
+                    for name, view in skin.views(scene).items():
+                        counts = alone[name].step(view, time=time).counts
+                        assert np.array_equal(found[name].counts.code, counts.code)
+                assert len(counts)
+                skin.reset(start=start)
+    codes = {
+        tuple(reading.counts.code.tolist())
+        for reading in skin.step(scenes(1)[0], time=9.0).values()
+    }
+    assert len(codes) == len(POSES)
+    with pytest.raises(SkinError, match="readout needs the time"):
+        skin.step(scenes(1)[0])
+    skin.use_readout(None)
+    assert skin.step(scenes(1)[0])["left"].counts is None
+    assert given.seed == 3
+
+
+def test_copies_of_a_simulator_have_chips_of_their_own(tiny: cs.Simulator) -> None:
+    """A simulator that is given twice is used once, and then a copy with other noise."""
+    sim = tiny.copy()
+    sim.use_readout("teensy")
+    made = make_simulators({"a": sim, "b": sim, "c": sim})
+    chips = [s.readout for s in made.values()]
+    assert chips[0] is sim.readout
+    assert [chip.seed for chip in chips] == [0, SEED_STRIDE, 2 * SEED_STRIDE]
 
 
 def test_a_field_of_another_design_is_refused(tiny: cs.Simulator) -> None:

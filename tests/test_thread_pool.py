@@ -75,7 +75,7 @@ def test_a_report_names_the_first_failure_and_lists_the_others() -> None:
 @pytest.mark.parametrize("threads", [0, -1, 1.5, True, "2"])
 def test_refused(threads: object) -> None:
     """Not a positive whole number."""
-    with pytest.raises(SceneError, match=r"threads is .*give a whole number from 1"):
+    with pytest.raises(ValueError, match=r"threads is .*give a whole number from 1"):
         ThreadPool(threads)  # type: ignore[arg-type]
 
 

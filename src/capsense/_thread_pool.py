@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._validate import as_whole
-from capsense.errors import CapSenseError, SceneError, listed
+from capsense.errors import CapSenseError, listed
 
 Array = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ class ThreadPool:
         threads: How many; by default as many as the process may use processors.
 
     Raises:
-        SceneError: ``threads`` is not a positive whole number.
+        ValueError: ``threads`` is not a positive whole number.
     """
 
     def __init__(self, threads: int | None = None) -> None:
@@ -108,7 +108,7 @@ class ThreadPool:
             threads = processors()
         whole = as_whole(threads)
         if whole is None or whole < 1:
-            raise SceneError(f"threads is {threads!r}; give a whole number from 1")
+            raise ValueError(f"threads is {threads!r}; give a whole number from 1")
         self.threads = whole
         """How many threads read, the calling one included."""
         self._pool: ThreadPoolExecutor | None = None

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from capsense.cover import Touch
 
 if TYPE_CHECKING:
-    from capsense.readout.conversions import Counts
+    from capsense.field.background import Charges
+    from capsense.readout.conversions import Counts, Held
 
 Array = NDArray[np.float64]
+
+
+class KeptField(Protocol):
+    """What a reading knows of the field around the sensor."""
+
+    def potentials(self, points: Array) -> Array: ...
+
+    def charges(self) -> Charges | None: ...
 
 
 @dataclass(frozen=True)
@@ -45,7 +54,8 @@ class Reading:
     """Change against the empty domain, ``capacitance - baseline`` [F], shape (M, M)."""
     stats: StepStats
     electrode_names: tuple[str, ...]
-    _shield_coupling: Array = field(repr=False)
+    shield_coupling: Array = field(repr=False)
+    """Charge on each electrode per volt on all shields together [F], shape (M,)."""
     counts: Counts | None = None
     """What the chip has reported since the reading before, where a readout is configured."""
     jacobian: Array | None = None
@@ -60,6 +70,62 @@ class Reading:
     touch: Touch | None = None
     """Force [N] and compression [m] of the cover above each electrode, if the design has a
     ``[[cover]]``."""
+    _field: KeptField | None = field(default=None, repr=False)
+
+    @property
+    def error(self) -> float:
+        """Estimated error of the largest entry [F], ``stats.solver_error``."""
+        return self.stats.solver_error
+
+    @property
+    def held(self) -> Held | None:
+        """What the chip's registers hold, ``counts.held()``, where a readout is configured."""
+        return None if self.counts is None else self.counts.held()
+
+    def potentials(self, points: ArrayLike) -> Array:
+        """Potentials at points in front of the sensor [V], for drawing.
+
+        They are those of the compact Green's function: right to some per cent from 2 mm in front of
+        the electrodes on, and of no meaning behind them. Bodies that float are at the potential
+        they take.
+
+        Args:
+            points: Points [m] in the sensor frame, shape (n, 3).
+
+        Returns:
+            Shape (n, terminals), in the order of ``simulator.background.terminals``: each at 1 V in
+            its own column, all others at 0.
+
+        Raises:
+            SceneError: The points do not have shape (n, 3).
+            ValueError: The field was not kept.
+        """
+        from capsense.scene.shapes import as_points
+
+        return self._kept("potentials").potentials(as_points(points))
+
+    def charges(self) -> Charges | None:
+        """Charges on the bodies, for drawing.
+
+        Returns:
+            Places and densities; None where no body was near.
+
+        Raises:
+            ValueError: The field was not kept.
+        """
+        return self._kept("charges").charges()
+
+    def _kept(self, what: str) -> KeptField:
+        if self._field is None:
+            raise ValueError(
+                f"the reading has no {what}, as its field was not kept; write "
+                "step(scene, keep_field=True)"
+            )
+        return self._field
+
+    def with_field(self, known: KeptField) -> Reading:
+        """The same reading, which keeps what is known of its field."""
+        return replace(self, _field=known)
 
     @property
     def self_capacitance(self) -> Array:
@@ -68,7 +134,7 @@ class Reading:
         Electrode i is driven, shields are driven with it, all other electrodes are grounded:
         the diagonal of the Maxwell matrix plus the (negative) coupling to the shields.
         """
-        return np.diag(self.capacitance) + self._shield_coupling
+        return np.diag(self.capacitance) + self.shield_coupling
 
     @property
     def mutual_capacitance(self) -> Array:

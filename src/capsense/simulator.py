@@ -12,29 +12,22 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from capsense._frozen import read_only
 from capsense._thread_pool import ForkSafeRLock, ThreadPool, some_failed
-from capsense._validate import checked_frequency, shorten
+from capsense._validate import as_number, checked_frequency, shorten
 from capsense.cover import Touch
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError, SceneError
-from capsense.field.background import (
-    BackgroundField,
-    BuildSettings,
-    CapacitanceChange,
-    Charges,
-    Terminals,
-)
+from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError
+from capsense.field.background import BackgroundField, BuildSettings, CapacitanceChange, Terminals
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.reading import Reading, StepStats
+from capsense.reading import KeptField, Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.contact import warn_of_contact, warn_of_doubt
 from capsense.scene.depth import DepthFrame
-from capsense.scene.shapes import as_points
 
 if TYPE_CHECKING:
     from capsense.masked import MeshSensor
@@ -43,7 +36,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Method = Literal["surface", "fem_masked"]
-PresetName = Literal["standard", "learning", "fine"]
+PresetName = Literal["fast", "standard", "fine", "learning"]
+"""Names of presets; ``"learning"`` is another name for ``"fast"``."""
+DEFAULT_PRESET: PresetName = "standard"
+"""The preset of whatever is given none."""
+DEFAULT_DESIGN = "six_patch"
+"""The design of whatever is given none."""
+_OTHER_NAMES: dict[str, PresetName] = {"learning": "fast"}
 
 _TURNS = 6
 """Parts of a batch, for each thread, at least: no thread then waits long for another."""
@@ -67,9 +66,7 @@ class _Solver(Protocol):
 
     def solve_each(self, scenes: Sequence[Scene]) -> list[CapacitanceChange | CapSenseError]: ...
 
-    def potentials(self, points: Array) -> Array: ...
-
-    def charges(self) -> Charges | None: ...
+    def field(self) -> KeptField: ...
 
     def reset(self) -> None: ...
 
@@ -80,12 +77,12 @@ class Simulator:
     Threads may share one: they take turns. :meth:`step_batch` uses several at a time.
 
     Args:
-        design: A design, a packaged name, or the path of a design file.
+        design: A design, a packaged name, or the path of a design file; by default ``"six_patch"``.
         method: ``"surface"``: charges on the surfaces of the bodies. ``"fem_masked"``: the scheme
             of Schöffmann et al. 2022, where objects are staircases of tetrahedra. By default
             ``"fem_masked"`` on a mesh, else ``"surface"``.
-        preset: How finely surfaces are resolved: ``"standard"``, ``"learning"`` (faster, some
-            3 % rms) or ``"fine"``.
+        preset: How finely surfaces are resolved: ``"fast"`` (some 3 % rms), ``"standard"`` or
+            ``"fine"``. ``"learning"`` is another name for ``"fast"``.
         excitation_frequency: Excitation frequency [Hz]; decides which materials conduct.
         settings: Numerical settings of the background field; default from ``design.build``.
         cache_dir: Where built fields are kept; default the user's cache directory.
@@ -100,7 +97,7 @@ class Simulator:
     Raises:
         DesignError: The design is wrong.
         MeshError: The mesh is not around the sensor frame's origin, or lacks a node group.
-        ValueError: Neither or both of design and mesh are given, or an option is wrong.
+        ValueError: Both a design and a mesh are given, or an option is wrong.
         ReadoutError: There is no such chip or file, or the file is wrong.
         FieldError: The background field could not be built, or ``background`` is of another design.
     """
@@ -110,7 +107,7 @@ class Simulator:
         design: Design | str | Path | None = None,
         *,
         method: Method | None = None,
-        preset: PresetName = "standard",
+        preset: PresetName = DEFAULT_PRESET,
         excitation_frequency: float = 250e3,
         settings: BuildSettings | None = None,
         cache_dir: Path | None = None,
@@ -120,21 +117,17 @@ class Simulator:
         mesh: TetMesh | MeshSensor | None = None,
     ) -> None:
         method = method or ("surface" if mesh is None else "fem_masked")
-        for what, chosen, known in (
-            ("method", method, get_args(Method)), ("preset", preset, get_args(PresetName)),
-        ):  # fmt: skip
-            if chosen not in known:
-                raise ValueError(
-                    f"{what} is {shorten(chosen)}; choose one of {', '.join(map(repr, known))}"
-                )
+        if method not in get_args(Method):
+            known = ", ".join(map(repr, get_args(Method)))
+            raise ValueError(f"method is {shorten(method)}; choose one of {known}")
         self.method: Method = method
-        self.preset: PresetName = preset
+        self.preset: PresetName = checked_preset(preset)
         self.excitation_frequency = checked_frequency(excitation_frequency)
-        if (mesh is None) == (design is None):
+        if mesh is not None and design is not None:
             raise ValueError("give either a design or mesh=…, a TetMesh or a MeshSensor")
         self.mesh = None if mesh is None else self._on_mesh(mesh)
         """The mesh that was given in place of a design, or None."""
-        given = self.mesh.design if self.mesh is not None else cast("Design | str | Path", design)
+        given = self.mesh.design if self.mesh is not None else design or DEFAULT_DESIGN
         self.design = given if isinstance(given, Design) else load_design(given)
         if self.method == "fem_masked" and self.design.domain.open:
             raise ValueError(
@@ -221,26 +214,40 @@ class Simulator:
         empty = self._terminals.empty
         return self._reading(np.zeros_like(empty), empty, StepStats(0.0, 0.0))
 
-    def use_readout(self, readout: Readout | str | Path | None, *, start: float = 0.0) -> None:
+    def use_readout(
+        self,
+        readout: Readout | str | Path | None,
+        *,
+        start: float | None = None,
+        seed: int | None = None,
+    ) -> None:
         """Read through a chip from now on.
 
         Args:
             readout: A readout of this sensor alone, the name of a chip with its usual settings,
                 the path of a readout file (``.toml``), or None.
-            start: Time at which it is switched on [s].
+            start: Time at which it is switched on [s], by default 0.
+            seed: Of its noise, by default its own.
 
         Raises:
-            ReadoutError: There is no such chip or file, or the file is wrong.
+            ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
+                number from 0 on.
         """
+        from capsense.readout.config import make_readout
+
         self.readout = None
         if readout is not None:
-            from capsense.readout.config import make_readout
-
-            self.readout = make_readout(readout, self)
-            self.readout.reset(start=start)
+            chip = make_readout(readout, self)
+            chip.reset(start=0.0 if start is None else start, seed=seed)
+            self.readout = chip
 
     def step(
-        self, scene: Scene | DepthFrame, *, time: float | None = None, jacobian: bool = False
+        self,
+        scene: Scene | DepthFrame,
+        *,
+        time: float | None = None,
+        jacobian: bool = False,
+        keep_field: bool = False,
     ) -> Reading:
         """Return the reading of a scene or of a depth camera's view, given in the sensor frame.
 
@@ -253,28 +260,55 @@ class Simulator:
                 the relaxation and hysteresis of a cover follow it: without it there are none.
             jacobian: Whether to work out ``reading.jacobian`` as well; it adds about 50 % to the
             step.
+            keep_field: Whether the reading keeps what ``reading.potentials`` and
+                ``reading.charges`` work with, of some megabytes.
 
         Raises:
-            SceneError: ``scene`` is neither a scene nor a depth frame, or has no Jacobian.
+            TypeError: ``scene`` is neither a scene nor a depth frame.
+            SceneError: ``scene`` has no Jacobian, or its depth image is wrong.
             SolveError: The solver found no solution.
             ReadoutError: A readout is given no time, or time went back.
-            ValueError: A Jacobian is asked for of a method that has none.
+            ValueError: A Jacobian or the field is asked for of a method that has none.
         """
-        start = perf_counter()
-        _check_view("step takes", scene)
-        if jacobian and self.method == "fem_masked":
-            raise ValueError('method "fem_masked" has no Jacobian; use "surface"')
+        check_view("step takes", scene)
         if self.readout is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(scene, time=…), in seconds")
-        if isinstance(scene, DepthFrame):
-            scene = scene.scene()
         with self._one:
-            self.steps += 1
-            found = self._solver.solve(scene, jacobian=jacobian, time=time)
-            reading = self._of(found, scene, perf_counter() - start)
+            reading = self._of(*self._found(scene, time, jacobian, keep_field))
+            if keep_field:
+                reading = reading.with_field(self._solver.field())
             if self.readout is None or time is None:
                 return reading
             return replace(reading, counts=self.readout.sample(time, reading))
+
+    def solved(
+        self,
+        scene: Scene | DepthFrame,
+        *,
+        time: float | None = None,
+        jacobian: bool = False,
+        keep_field: bool = False,
+    ) -> Reading:
+        """As :meth:`step`, without the readout, which is left as it is."""
+        check_view("step takes", scene)
+        with self._one:
+            reading = self._of(*self._found(scene, time, jacobian, keep_field))
+            return reading.with_field(self._solver.field()) if keep_field else reading
+
+    def _found(
+        self, scene: Scene | DepthFrame, time: float | None, jacobian: bool, keep_field: bool
+    ) -> tuple[CapacitanceChange, Scene, float]:
+        """What the solver finds, of which scene, and the time that it took [s]."""
+        start = perf_counter()
+        if jacobian and self.method == "fem_masked":
+            raise ValueError('method "fem_masked" has no Jacobian; use "surface"')
+        if keep_field and self.method == "fem_masked":
+            raise ValueError('method "fem_masked" keeps no field; use "surface"')
+        if isinstance(scene, DepthFrame):
+            scene = scene.scene()
+        self.steps += 1
+        found = self._solver.solve(scene, jacobian=jacobian, time=time)
+        return found, scene, perf_counter() - start
 
     def _of(self, found: CapacitanceChange, scene: Scene, seconds: float) -> Reading:
         """The reading that a solver's result makes, which took some time [s]."""
@@ -341,26 +375,60 @@ class Simulator:
         )
 
     def step_batch(
-        self, scenes: Sequence[Scene | DepthFrame], *, threads: int | None = None
+        self,
+        scenes: Sequence[Scene | DepthFrame],
+        *,
+        times: Sequence[float] | None = None,
+        threads: int | None = None,
     ) -> list[Reading]:
         """Return the readings of many scenes, each solved on whichever thread is free.
 
-        Readings are those of :meth:`reset` and :meth:`step`, to the last bit, without a readout.
-        They do not depend on the number of threads, nor on what stands beside them in the batch.
-        This sensor's own last step and count stay as they are.
+        Capacitances are those of :meth:`reset` and :meth:`step`, to the last bit. They do not
+        depend on the number of threads, nor on what stands beside them in the batch: a cover has
+        no relaxation and no hysteresis. This sensor's own last step and count stay as they are.
+
+        A :attr:`readout` goes on from where it is. It is told the scenes in their order, once all
+        of them are solved; if some fail, it is told none.
 
         Args:
             scenes: Scenes or depth frames, in the sensor frame.
+            times: Their times [s], none before the one in front of it; a readout needs them.
             threads: How many threads solve; by default as many as the process may use processors.
 
         Raises:
-            SceneError: Something in ``scenes`` is neither a scene nor a depth frame, or
-                ``threads`` is not a positive whole number.
-            BatchError: Some scenes failed; it holds the readings of the others.
+            TypeError: Something in ``scenes`` is neither a scene nor a depth frame.
+            ValueError: ``times`` are not as many as the scenes, or ``threads`` is not a positive
+                whole number.
+            ReadoutError: A readout is given no times, or time goes back.
+            BatchError: Some scenes failed; it holds the readings of the others, without counts.
         """
         scenes = list(scenes)
+        told = None if times is None else [as_number(time) for time in times]
+        if told is not None and len(told) != len(scenes):
+            raise ValueError(f"{len(told)} times for {len(scenes)} scenes; give one for each")
+        chip = self.readout
+        if chip is None:
+            return self.solved_batch(scenes, threads=threads)
+        if told is None:
+            raise ReadoutError(
+                "a readout needs the times of the scenes; write step_batch(scenes, times=[…]), in "
+                "seconds, or solved_batch(scenes) for capacitances alone"
+            )
+        with self._one:
+            chip.require_times(told)
+            readings = self.solved_batch(scenes, threads=threads)
+            return [
+                replace(reading, counts=chip.sample(time, reading))
+                for time, reading in zip(told, readings, strict=True)
+            ]
+
+    def solved_batch(
+        self, scenes: Sequence[Scene | DepthFrame], *, threads: int | None = None
+    ) -> list[Reading]:
+        """The same as :meth:`step_batch`, without the readout, which is left as it is."""
+        scenes = list(scenes)
         for number, scene in enumerate(scenes):
-            _check_view(f"scenes[{number}]: a batch holds", scene)
+            check_view(f"scenes[{number}]: a batch holds", scene)
 
         pool = ThreadPool(threads)
         size = min(self._solver.together, -(-len(scenes) // (_TURNS * pool.threads)))
@@ -396,36 +464,6 @@ class Simulator:
             for f, scene in zip(found, plain, strict=True)
         ]
 
-    def potentials(self, points: ArrayLike) -> Array:
-        """Potentials of the last step at points in front of the sensor [V], for drawing.
-
-        Potentials are those of the compact Green's function: right to some per cent from 2 mm in
-        front of the electrodes on, and of no meaning behind them. Bodies that float are at the
-        potential they take.
-
-        Args:
-            points: Points [m] in the sensor frame, shape (n, 3).
-
-        Returns:
-            Shape (n, terminals), in the order of ``background.terminals``: each at 1 V in its own
-            column, all others at 0.
-
-        Raises:
-            SceneError: The points do not have shape (n, 3).
-            ValueError: The method is ``"fem_masked"``, which solves on a mesh of its own.
-        """
-        with self._one:
-            return self._solver.potentials(as_points(points))
-
-    def charges(self) -> Charges | None:
-        """Charges on the bodies of the last step, for drawing.
-
-        Returns:
-            Places and densities; None where no body was near, or with ``"fem_masked"``.
-        """
-        with self._one:
-            return self._solver.charges()
-
     def copy(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field.
 
@@ -437,22 +475,27 @@ class Simulator:
             background=self._background, mesh=self.mesh,
         )  # fmt: skip
 
-    def reset(self, *, seed: int | None = None, start: float = 0.0) -> None:
-        """Forget the step before, from which ``"fem_masked"`` starts, and what the cover remembers
-        of its contacts; restart the chip.
+    def reset(self, *, start: float | None = None, seed: int | None = None) -> None:
+        """Forget the step before, see :meth:`forget`, and restart the chip.
 
         Args:
-            seed: Of the readout's noise from now on; by default its random numbers repeat.
-            start: Time at which it is switched on [s].
+            start: Time at which it is switched on [s], by default 0.
+            seed: Of its noise from now on; by default its random numbers repeat.
 
         Raises:
             ReadoutError: The seed is no whole number from 0 on.
         """
         with self._one:
+            self.forget()
+            if self.readout is not None:
+                self.readout.reset(start=0.0 if start is None else start, seed=seed)
+
+    def forget(self) -> None:
+        """Forget the step before, from which ``"fem_masked"`` starts, and what the cover remembers
+        of its contacts. The chip goes on."""
+        with self._one:
             self._solver.reset()
             self.steps = 0
-            if self.readout is not None:
-                self.readout.reset(start=start, seed=seed)
 
     def describe(self) -> dict[str, float | int | str]:
         """Return the figures of the design's field."""
@@ -469,8 +512,27 @@ class Simulator:
         }  # fmt: skip
 
 
-def _check_view(where: str, scene: object) -> None:
+def checked_preset(preset: object) -> PresetName:
+    """The name of a preset, by the one name that it goes by.
+
+    Raises:
+        ValueError: There is none of that name.
+    """
+    known = [name for name in get_args(PresetName) if name not in _OTHER_NAMES]
+    if not isinstance(preset, str) or preset not in (*known, *_OTHER_NAMES):
+        raise ValueError(
+            f"preset is {shorten(preset)}; choose one of {', '.join(map(repr, known))}"
+        )
+    return cast("PresetName", _OTHER_NAMES.get(preset, preset))
+
+
+def check_view(where: str, scene: object) -> None:
+    """Refuse what is neither a scene nor a depth frame.
+
+    Raises:
+        TypeError: It is neither.
+    """
     if not isinstance(scene, (Scene, DepthFrame)):
-        raise SceneError(
+        raise TypeError(
             f"{where} a Scene or a DepthFrame, not {type(scene).__name__}; write Scene([...])"
         )

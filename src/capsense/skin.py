@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,9 @@ from capsense._validate import shorten, suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError, SkinError
 from capsense.reading import Reading
+from capsense.readout import SEED_STRIDE, Readout
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Simulator
+from capsense.simulator import Simulator, check_view
 
 Array = NDArray[np.float64]
 AnyDesign = Design | str | Path | Simulator
@@ -26,11 +29,14 @@ class Skin:
 
     Args:
         sensors: Name → design (or packaged name, design file, simulator) and the pose of its
-            sensor frame in the world. Sensors of one design share its field.
+            sensor frame in the world. Sensors of one design share its field. A simulator is used
+            itself, with its readout; where it is given again, a copy with a chip of its own.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
-        SceneError: There is no sensor, or something is not a pair of a design and a pose.
+        TypeError: ``sensors`` is no dict, or something in it is not a pair of a design and a pose.
+        ValueError: ``threads`` is not a positive whole number.
+        SceneError: There is no sensor.
         DesignError: A design is wrong.
         FieldError: A background field could not be built.
     """
@@ -42,18 +48,24 @@ class Skin:
         self.poses: dict[str, Pose] = {}
         """Where the sensor frames stand in the world."""
         if not isinstance(sensors, Mapping):
-            raise SceneError(
+            raise TypeError(
                 f'sensors is {shorten(sensors)}; give a dict such as {{"wrist": (design, Pose(…))}}'
             )
         for name, pair in sensors.items():
             if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], Pose)):
-                raise SceneError(f"sensor {name!r} is {pair!r}; give a pair (design, Pose(…))")
+                raise TypeError(f"sensor {name!r} is {pair!r}; give a pair (design, Pose(…))")
             designs[name], self.poses[name] = pair
         self._pool, self._one = ThreadPool(threads), ForkSafeRLock()
         self.simulators: dict[str, Simulator] = make_simulators(designs)
         """The sensors themselves."""
 
-    def step(self, scene: Scene, poses: Mapping[str, Pose] | None = None) -> dict[str, Reading]:
+    def step(
+        self,
+        scene: Scene,
+        poses: Mapping[str, Pose] | None = None,
+        *,
+        time: float | None = None,
+    ) -> dict[str, Reading]:
         """Read all sensors in a scene.
 
         Every sensor sees the bodies that reach into its own domain.
@@ -61,22 +73,24 @@ class Skin:
         Args:
             scene: Bodies with their poses in the world.
             poses: Where sensors stand now, of those that have moved; it is remembered.
+            time: Time of the scene [s], as of :meth:`Simulator.step`; readouts need it.
 
         Returns:
             Name → reading, in the order of the sensors; the same as from the sensors one by one,
             to the last bit.
 
         Raises:
-            SceneError: ``scene`` is not a scene, or there is no sensor of a name in ``poses``.
+            TypeError: ``scene`` is not a scene.
+            SceneError: There is no sensor of a name in ``poses``.
             SkinError: Some sensors failed; it holds the readings of the others.
         """
         with self._one:  # poses are remembered
-            return self.step_views(self.views(scene, poses))
+            return self.step_views(self.views(scene, poses), time=time)
 
     def views(self, scene: Scene, poses: Mapping[str, Pose] | None = None) -> dict[str, Scene]:
         """What each sensor sees of a scene, in its own frame; arguments as of :meth:`step`."""
         if not isinstance(scene, Scene):
-            raise SceneError(f"step takes a Scene, not {type(scene).__name__}; write Scene([...])")
+            raise TypeError(f"step takes a Scene, not {type(scene).__name__}; write Scene([...])")
         self._check_names("poses", poses or {})
         self.poses.update(poses or {})
         bounds = scene.pack().bounds
@@ -86,24 +100,65 @@ class Skin:
             for name, simulator in self.simulators.items()
         }
 
-    def step_views(self, views: Mapping[str, Scene | DepthFrame]) -> dict[str, Reading]:
+    def step_views(
+        self, views: Mapping[str, Scene | DepthFrame], *, time: float | None = None
+    ) -> dict[str, Reading]:
         """Read sensors that each see something of their own.
 
         Args:
             views: Name → what the sensor sees, in its own frame; sensors may be left out.
+            time: Time of the views [s]; readouts need it.
 
         Raises:
+            TypeError: A view is neither a scene nor a depth frame.
             SceneError: There is no sensor of a name in ``views``.
             SkinError: Some sensors failed; it holds the readings of the others.
         """
         self._check_names("views", views)
-        tasks = {name: partial(self.simulators[name].step, view) for name, view in views.items()}
+        for name, view in views.items():
+            check_view(f"views[{name!r}]: step takes", view)
+        tasks = {
+            name: partial(self.simulators[name].step, view, time=time)
+            for name, view in views.items()
+        }
         return read_all(self._pool, tasks)
 
-    def reset(self) -> None:
-        """Forget the previous step."""
-        for simulator in self.simulators.values():
-            simulator.reset()
+    def use_readout(
+        self,
+        readout: Readout | str | Path | None,
+        *,
+        start: float | None = None,
+        seed: int | None = None,
+    ) -> None:
+        """Read every sensor through a chip of its own from now on.
+
+        Args:
+            readout: A readout, which stays as it is, the name of a chip with its usual settings,
+                the path of a readout file (``.toml``), or None.
+            start: Time at which they are switched on [s], by default 0.
+            seed: Of the first sensor's noise, by default its own; those of the others follow at
+                steps of 2³², so that noise is not shared.
+
+        Raises:
+            ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
+                number from 0 on.
+        """
+        with self._one:
+            use_readouts(self.simulators, readout, start, seed)
+
+    def reset(self, *, start: float | None = None, seed: int | None = None) -> None:
+        """Forget the previous step; restart the chips.
+
+        Args:
+            start: Time at which they are switched on [s], by default 0.
+            seed: Of the first sensor's noise from now on, as of :meth:`use_readout`; by default all
+                random numbers repeat.
+
+        Raises:
+            ReadoutError: The seed is no whole number from 0 on.
+        """
+        with self._one:
+            reset_all(self.simulators, start, seed)
 
     def __len__(self) -> int:
         return len(self.simulators)
@@ -145,11 +200,48 @@ def make_simulators(designs: Mapping[str, AnyDesign]) -> dict[str, Simulator]:
     for name, design in designs.items():
         key = design if isinstance(design, str | Path) else id(design)
         if key in first:
-            simulators[name] = first[key].copy()
+            simulators[name] = made = first[key].copy()
+            chip = first[key].readout
+            if chip is not None:
+                seed = chip.seed + (len(simulators) - 1) * SEED_STRIDE
+                made.use_readout(copy.deepcopy(chip), seed=seed)
             continue
         made = design if isinstance(design, Simulator) else Simulator(design)
         simulators[name] = first[key] = made
     return simulators
+
+
+class _WithChip(Protocol):
+    """A sensor of a skin, which may have a chip."""
+
+    readout: Readout | None
+
+    def use_readout(
+        self, readout: Readout | str | Path | None, *, start: float | None, seed: int | None
+    ) -> None: ...
+
+    def reset(self, *, start: float | None, seed: int | None) -> None: ...
+
+
+def use_readouts(
+    sensors: Mapping[str, _WithChip],
+    readout: Readout | str | Path | None,
+    start: float | None,
+    seed: int | None,
+) -> None:
+    """Give every sensor a chip of its own, see :meth:`Skin.use_readout`."""
+    for number, sensor in enumerate(sensors.values()):
+        sensor.use_readout(copy.deepcopy(readout), start=start, seed=None)
+        if sensor.readout is not None:
+            first = sensor.readout.seed if seed is None else seed
+            sensor.use_readout(sensor.readout, start=start, seed=first + number * SEED_STRIDE)
+
+
+def reset_all(sensors: Mapping[str, _WithChip], start: float | None, seed: int | None) -> None:
+    """Reset every sensor, see :meth:`Skin.reset`."""
+    for number, sensor in enumerate(sensors.values()):
+        own = None if seed is None else seed + number * SEED_STRIDE
+        sensor.reset(start=start, seed=own)
 
 
 def read_all(pool: ThreadPool, tasks: Mapping[str, Callable[[], Reading]]) -> dict[str, Reading]:

@@ -157,7 +157,7 @@ def test_what_is_no_environment_is_refused() -> None:
     (seen,) = names(cs.assistive_gym.attach(env).scene())
     assert seen.startswith("tool/")
     p.disconnect(env.id)
-    with pytest.raises(cs.SceneError, match=r"env is a int; .* Assistive Gym 1\.0 or later"):
+    with pytest.raises(TypeError, match=r"env is a int; .* Assistive Gym 1\.0 or later"):
         cs.assistive_gym.attach(3)
 
 

@@ -260,7 +260,7 @@ def test_a_reading_that_the_solver_itself_doubts_is_told(tiny_simulator: cs.Simu
     reading = sensor.read()
     largest = float(np.abs(reading.delta).max())
     rough = replace(reading, stats=replace(reading.stats, solver_error=0.6 * largest))
-    sensor.simulator.step_batch = lambda scenes, threads: [rough]  # type: ignore[method-assign]
+    sensor.simulator.solved_batch = lambda scenes, threads: [rough]  # type: ignore[method-assign]
     (found,) = sensor.check()
     assert f"changes by {1e15 * largest:.2g} fF" in found
     assert f"an error of {0.6e15 * largest:.2g} fF" in found

@@ -20,7 +20,7 @@ RISE = 0.3
 
 @pytest.fixture
 def simulator(foam: tuple[cs.Design, Any]) -> cs.Simulator:
-    return cs.Simulator(foam[0], preset="learning", background=foam[1])
+    return cs.Simulator(foam[0], preset="fast", background=foam[1])
 
 
 class MujocoBall:

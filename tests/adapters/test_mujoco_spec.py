@@ -83,7 +83,7 @@ def test_wrong_calls_name_the_fix(args: Any, message: str) -> None:
     cs.mujoco.add_sensor(spec, "world", cs.Pose(), "old")
     with pytest.raises(cs.SceneError, match=message):
         cs.mujoco.add_sensor(spec, *args)
-    with pytest.raises(cs.SceneError, match="spec is a str; give a mujoco"):
+    with pytest.raises(TypeError, match="spec is a str; give a mujoco"):
         cs.mujoco.add_sensor("model.xml", "link", ON_LINK)
     with pytest.raises(cs.SceneError, match="size is -1; give the width"):
         cs.mujoco.add_sensor(spec, "link", ON_LINK, "new", camera=-1)

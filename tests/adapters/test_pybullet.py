@@ -242,7 +242,7 @@ def test_wrong_calls_are_refused(
         ({"size": 0.2}, 'size goes with perception="depth_camera"'),
     ):
         call = {"client": client, "body": sensor.body, "design": tiny_simulator, **options}
-        with pytest.raises(cs.SceneError, match=message):
+        with pytest.raises(ValueError, match=message):
             cs.pybullet.attach(**call)
 
 

@@ -114,10 +114,10 @@ def test_presets_are_points_of_one_line(parts: dict[str, ModuleType], tmp_path: 
         preset: {
             "results": [row | {"median_ms": k, "settings": f"Simulator.step, preset {preset}"}]
         }
-        for k, preset in enumerate(("learning", "fine"), start=1)
+        for k, preset in enumerate(("fast", "fine"), start=1)
     }
     points = [report.rows(results, group)["capsense"] for group in results]
     assert len({report.point_key(point) for point in points}) == 2
-    assert [report.size_label(point) for point in points] == ["learning", "fine"]
+    assert [report.size_label(point) for point in points] == ["fast", "fine"]
     report.plot(results, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 1000

@@ -79,12 +79,12 @@ def test_random_scenes_hold_one_body_over_the_sensor(parts: dict[str, ModuleType
 
 def test_every_method_runs_with_every_preset(parts: dict[str, ModuleType]) -> None:
     found = parts["accuracy_map"].configurations(
-        ["surface"], ["learning", "fine"], ["excitation_frequency=1"]
+        ["surface"], ["fast", "fine"], ["excitation_frequency=1"]
     )
     assert found == [
         (
-            "surface learning excitation_frequency=1",
-            dict(method="surface", preset="learning", excitation_frequency=1),
+            "surface fast excitation_frequency=1",
+            dict(method="surface", preset="fast", excitation_frequency=1),
         ),
         (
             "surface fine excitation_frequency=1",
@@ -101,12 +101,12 @@ def test_the_curve_goes_from_fast_to_slow(
     figures = {"rms": 1.0, "p95": 2.0, "worst": 3.0}
     results = [
         {"label": "surface fine", "all": {**figures, "ms": 2.0}},
-        {"label": "surface learning", "all": {**figures, "ms": 0.5}},
+        {"label": "surface fast", "all": {**figures, "ms": 0.5}},
         {"label": "surface failed"},
     ]
     parts["accuracy_map"].curve(results)
     printed = capsys.readouterr().out
-    assert printed.index("learning") < printed.index("fine")
+    assert printed.index("fast") < printed.index("fine")
     assert "failed" not in printed
     parts["accuracy_map"].plot(results, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 1000

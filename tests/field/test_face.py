@@ -11,7 +11,7 @@ import shapely
 from capsense.design import parse_design
 from capsense.design.shapes import STRIP_ERROR
 from capsense.field.boundary import Accuracy, BoundarySolution
-from capsense.field.face import Plane, plane_panels, sheet_on_face
+from capsense.field.face import FacePlane, plane_panels, sheet_on_face
 from capsense.field.gap_table import build_gap_table
 
 REACH, RADIUS = 0.008, 0.03
@@ -29,13 +29,13 @@ def _design(radius: float | None):
     return parse_design(table if radius is None else table | {"bend": {"radius": radius}})
 
 
-def _plane(radius: float | None) -> tuple[Plane, BoundarySolution]:
+def _plane(radius: float | None) -> tuple[FacePlane, BoundarySolution]:
     solution = BoundarySolution(_design(radius), Accuracy(6.0, fitted=False))
     return plane_panels(solution, REACH), solution
 
 
 @pytest.fixture(scope="module")
-def bent() -> tuple[Plane, BoundarySolution]:
+def bent() -> tuple[FacePlane, BoundarySolution]:
     return _plane(RADIUS)
 
 

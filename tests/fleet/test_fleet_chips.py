@@ -78,7 +78,7 @@ def test_a_fleet_reads_through_chips():
     """Differential: against the chip of a simulator, without noise, shields driven along."""
     fleet = Fleet("six_patch", BODIES[:1], COUNT)
     fleet.use_readout(without_noise())
-    simulator = cs.Simulator("six_patch", preset="learning")
+    simulator = cs.Simulator("six_patch")
     rng = np.random.default_rng(5)
     chips = [without_noise() for _ in range(COUNT)]
     for k in range(4):
@@ -210,3 +210,27 @@ def test_refused_on_warp():
         on_warp(Readout(whole.bank, whole.schedule, whole.law, stages=[Own()]))
     with pytest.raises(ReadoutError, match="leaves electrodes open"):
         on_warp(Readout.preset("fdc1004", NAMES, patterns=self_patterns(NAMES, rest="floating")))
+
+
+def test_chips_are_switched_on_anew():
+    """Invariant: a reset repeats the noise, or draws other; the readout given stays as it is."""
+    fleet, given = Fleet("six_patch", BODIES[:1], 2), Readout.preset("teensy", NAMES, seed=4)
+    where = poses(np.random.default_rng(8), 2, 1)
+
+    def codes(begun=0.0):
+        return [fleet.step(where, time=begun + 0.05 * k).held.code.tolist() for k in range(3)]
+
+    fleet.use_readout(given)
+    first = codes()
+    fleet.reset()
+    assert codes() == first
+    fleet.reset(start=5.0)
+    assert codes(5.0) == first
+    fleet.reset(seed=9)
+    assert codes() != first
+    fleet.use_readout("teensy", seed=4)
+    assert codes() == first
+    assert given.seed == 4
+    fleet.use_readout(None)
+    assert fleet.step(where).held is fleet.readout is None
+    fleet.reset()

@@ -51,7 +51,7 @@ def test_meshes(device):
     where[..., :3] = [[-0.09, 0.0, 0.06], [0.0, 0.0, 0.07], [0.08, 0.0, 0.06]]
     bodies = meshes()
     if device == "cpu":
-        simulator = cs.Simulator("six_patch", preset="learning")
+        simulator = cs.Simulator("six_patch")
         fleet = Fleet("six_patch", bodies, COUNT)
         assert compared(fleet, bodies, where, sensors, simulator) < 1e-5
         return
@@ -71,6 +71,6 @@ def test_limbs(device):
     where[:, :, 0] += np.linspace(-0.05, 0.05, COUNT)[:, None]
     fleet = Fleet("six_patch", bodies, COUNT, device=device, budget=128)
     fleet.join(range(len(bodies)))
-    simulator = cs.Simulator("six_patch", preset="learning" if device == "cpu" else "standard")
+    simulator = cs.Simulator("six_patch")
     bound = 1e-5 if device == "cpu" else 0.02
     assert compared(fleet, bodies, where, sensors, simulator) < bound

@@ -32,7 +32,7 @@ def test_a_ball_is_pressed_in_as_deep_as_a_foundation_says(foam_field: cs.Design
 
 def test_fleets_feel_what_simulators_feel(foam_field: cs.Design) -> None:
     """Differential: forces, overlaps and both together, on two sensors of which one is turned."""
-    sim = cs.Simulator(foam_field, preset="learning")
+    sim = cs.Simulator(foam_field)
     box = cs.Body(cs.Box((0.01, 0.01, 0.01)), cs.Pose((0.012, 0.001, 0.0067)), "wood")
     forces = np.array([[0.5, np.nan], [np.nan, np.nan], [0.0, 0.3], [2.0, 0.1]])
     bodies = [ball(), box]
@@ -96,7 +96,7 @@ def test_fleets_refuse_what_they_cannot_do_with_forces(foam_field: cs.Design) ->
 
 def test_lossy_matter_is_pressed_in_too(foam_field: cs.Design) -> None:
     body = ball(0.5, material=cs.Material("wet", 30.0, 1e-4))
-    sim = cs.Simulator(foam_field, preset="learning")
+    sim = cs.Simulator(foam_field)
     truth = sim.step(cs.Scene([body]))
     found = cs.Fleet(foam_field, [body], 1).step([[pose(body)]])
     assert truth.conductance is not None

@@ -48,7 +48,7 @@ def test_example_and_both_kinds_of_sensors():
     site = LinkSite(wall.links[0], (0.02, 0.0, 0.0), (0.0, half, 0.0, half))
     sensors = GenesisSensors(scene, [site], materials={"cylinder*": "human"})
     delta = sensors.read().delta
-    simulator = cs.Simulator("six_patch", preset="learning")
+    simulator = cs.Simulator("six_patch")
     seen = cs.Pose((0.0, 0.0, 1.0), (0.0, half, 0.0, half)).inverse()
     shape = cs.Cylinder(0.035, 0.24)
     for e in range(3):

@@ -64,7 +64,7 @@ def test_a_scene_steps():
         data.qpos[:] = sim.data.qpos[w].numpy()
         mujoco.mj_forward(model, data)
         sensor = cs.mujoco.attach(
-            model, data, "robot/pad", cs.Simulator("six_patch", preset="learning"),
+            model, data, "robot/pad", cs.Simulator("six_patch"),
             materials={"*forearm": "human"},
         )  # fmt: skip
         truth = sensor.read().delta

@@ -64,7 +64,7 @@ def test_mujoco_warp(mujoco_worlds, device, bound):
         mujoco.mj_forward(model, data)
         for s, site in enumerate(sensors.sites):
             sensor = cs.mujoco.attach(
-                model, data, site, cs.Simulator("six_patch", preset="learning"),
+                model, data, site, cs.Simulator("six_patch"),
                 materials={"arm": "human"}, exclude=["floor"],
             )  # fmt: skip
             truth = sensor.read().delta
@@ -154,7 +154,7 @@ def test_newton(device, bound):
     sensor.update(state)
     found = sensor.delta if device is None else sensor.delta.numpy()
     assert found.shape == (WORLDS, 2, 6, 6)
-    simulator = cs.Simulator("six_patch", preset="learning")
+    simulator = cs.Simulator("six_patch")
     arm, table = cs.Capsule(0.02, 0.12), cs.Box((0.2, 0.2, 0.02))
     frames = [cs.Pose((0, 0, 0.5)), cs.Pose.from_euler((0.05, 0, 0.5), (0, 0.17, 0))]
     for w in range(WORLDS):

@@ -82,7 +82,7 @@ def test_lossy_matter_on_the_cpu():
     for place, body in enumerate(lossless):
         fleet.change(place, body, [1])
     reading = fleet.step(where, sensors)
-    simulator = cs.Simulator("six_patch", preset="learning")
+    simulator = cs.Simulator("six_patch")
     for e, s in np.ndindex(COUNT, 2):
         bodies = lossless if e == 1 else LOSSY
         truth = simulator.step(scene(bodies, where[e], sensors[e, s]))
@@ -141,7 +141,7 @@ def test_joined_conductors(device, kind):
     fleet.join([1, 2])
     if device == "cpu":
         found = fleet.step(where, sensors).delta
-        simulator = cs.Simulator("six_patch", preset="learning")
+        simulator = cs.Simulator("six_patch")
         for e in range(COUNT):
             truth = simulator.step(scene(bodies, where[e], sensors[e, 0])).delta
             assert np.abs(found[e, 0] - truth).max() < 1e-5 * np.abs(truth).max()

@@ -276,7 +276,7 @@ def test_side_by_side_begin_again() -> None:
 
 def test_side_by_side_refuses() -> None:
     for count in (0, True):
-        with pytest.raises(cs.SceneError, match="num_envs is"):
+        with pytest.raises(ValueError, match="num_envs is"):
             together(FOLLOW, count)
     envs = together(FOLLOW, np.int64(2))
     with pytest.raises(cs.SceneError, match="give 2 seeds"):

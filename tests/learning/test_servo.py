@@ -225,7 +225,7 @@ def test_ride_along_an_arm(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(world, "WAY", 0.025)
     env = world.LimbRide("arm", 0.05, Randomisation())
-    sim = cs.Simulator("six_patch", preset="learning")
+    sim = cs.Simulator("six_patch", preset="fast")
     found = world.ride(env, PoseEstimator(sim, Belief(taper=0.06), noise=0.4e-15), 1)
     assert not found.lost
     assert not found.force

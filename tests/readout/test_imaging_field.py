@@ -26,8 +26,8 @@ def sensor(simulators):
 
     def potentials(grid):
         nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
-        sim.step(cs.Scene())
-        return sim.potentials(nodes.reshape(-1, 3))[:, :6].reshape(*nodes.shape[:3], 6)
+        reading = sim.step(cs.Scene(), keep_field=True)
+        return reading.potentials(nodes.reshape(-1, 3))[:, :6].reshape(*nodes.shape[:3], 6)
 
     return sim, potentials
 

@@ -30,7 +30,7 @@ def scene(k: int = 0) -> cs.Scene:
 @pytest.mark.parametrize("source", [3, "six_patch", cs.load_design("six_patch")])
 def test_what_reads_nothing(path: Path, source: object) -> None:
     """Neither a simulator nor a sensor; no file is begun."""
-    with pytest.raises(RecordingError, match=r"source is of \w+; give a Simulator, or a sensor"):
+    with pytest.raises(TypeError, match=r"source is of \w+; give a Simulator, or a sensor"):
         cs.record(path, source)  # type: ignore[arg-type]
     assert not path.exists()
 

@@ -25,7 +25,7 @@ def scene(force: float | None, other: float | None = None) -> cs.Scene:
 @pytest.fixture
 def run(foam_field: cs.Design, tmp_path: Path) -> tuple[Path, list[cs.Reading]]:
     """Five steps of a ball on a foam; the file, and the readings returned."""
-    path, sim = tmp_path / "touch.mcap", cs.Simulator(foam_field, preset="learning")
+    path, sim = tmp_path / "touch.mcap", cs.Simulator(foam_field, preset="fast")
     with cs.record(path, sim) as recorder:
         return path, [recorder.step(scene(f), 0.1 * k) for k, f in enumerate(FORCES)]
 
@@ -46,7 +46,7 @@ def test_touch_comes_back_and_replays(run: tuple[Path, list[cs.Reading]]) -> Non
 
 def test_a_changed_force_is_found(foam_field: cs.Design, tmp_path: Path) -> None:
     """Mutation: the recording claims another touch than the simulator gives."""
-    path, sim = tmp_path / "other.mcap", cs.Simulator(foam_field, preset="learning")
+    path, sim = tmp_path / "other.mcap", cs.Simulator(foam_field, preset="fast")
     with cs.record(path, sim) as recorder:
         reading = sim.step(scene(0.5), time=0.0)
         assert reading.touch is not None
@@ -64,7 +64,7 @@ def test_a_viscous_cover_replays_by_its_times(foam_field: cs.Design, tmp_path: P
     cover = foam_field.cover
     assert cover is not None
     slow = replace(foam_field, cover=replace(cover, relaxation=((0.5, 0.2),), hysteresis=0.3))
-    path, sim = tmp_path / "slow.mcap", cs.Simulator(slow, preset="learning")
+    path, sim = tmp_path / "slow.mcap", cs.Simulator(slow, preset="fast")
     with cs.record(path, sim) as recorder:
         depths = [
             recorder.step(scene(1.0), 0.1 * k).touch.compression[0]  # type: ignore[union-attr]

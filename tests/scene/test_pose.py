@@ -125,3 +125,44 @@ def test_radians_beyond_a_turn_look_like_degrees(recwarn):
 def test_bad_angles_are_refused():
     with pytest.raises(SceneError, match="roll, pitch, yaw"):
         Pose.from_euler((0, 0, 0), (1, 2))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_from_mujoco(seed):
+    """Differential: MuJoCo's own frames of a turned body, by quaternion and by matrix."""
+    mujoco = pytest.importorskip("mujoco", reason='needs pip install "capsense[mujoco]"')
+    rng = np.random.default_rng(seed)
+    position, quaternion = rng.normal(size=3), rng.normal(size=4)
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body name='b'><freejoint/><geom size='.1'/><site name='s'/></body>"
+        "</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qpos[3:] = position, quaternion
+    mujoco.mj_forward(model, data)
+    w, x, y, z = quaternion
+    expected = Pose(position, (x, y, z, w)).matrix
+    for place, orientation in (
+        (data.xpos[1], data.xquat[1]), (data.xpos[1], data.xmat[1]),
+        (data.site_xpos[0], data.site_xmat[0]), (data.xpos[1], data.xmat[1].reshape(3, 3)),
+        (position.tolist(), tuple(quaternion)),
+    ):  # fmt: skip
+        np.testing.assert_allclose(
+            Pose.from_mujoco(place, orientation).matrix, expected, rtol=0, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize(
+    ("orientation", "message"),
+    [
+        ((1.0, 0.0, 0.0), r"orientation has shape \(3,\); give a quaternion \(w, x, y, z\)"),
+        ("wxyz", "orientation has shape"),
+        ((0.0, 0.0, 0.0, 0.0), "of length zero"),
+        ((np.nan, 0.0, 0.0, 0.0), "not finite"),
+        (2.0 * np.eye(3), "is not a rotation"),
+    ],
+)
+def test_from_mujoco_refuses(orientation, message):
+    """By name, with the fix."""
+    with pytest.raises(SceneError, match=message):
+        Pose.from_mujoco((0.0, 0.0, 0.0), orientation)

@@ -147,7 +147,7 @@ def test_parts_are_as_small_as_asked_for() -> None:
 def test_conductors_have_parts() -> None:
     """Unit: not dielectrics, small bodies or wide ones, and not for learning; made once a size."""
     finest = PRESETS["standard"].finest
-    assert PRESETS["learning"].finest is None
+    assert PRESETS["fast"].finest is None
     for shape, conducting, wanted in (
         (LIMB, True, True), (LIMB, False, False), (cs.Sphere(0.01), True, False),
     ):  # fmt: skip

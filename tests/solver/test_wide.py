@@ -176,7 +176,7 @@ def test_fleets_read_as_simulators():
     where[..., 6] = 1.0
     where[:, 0, :3], where[:, 1, :3] = (0.01, 0.0, 0.12), (0.02, 0.0, 0.06)
     found = fleet.step(where).delta[:, 0]
-    simulator = cs.Simulator("six_patch", preset="learning")
+    simulator = cs.Simulator("six_patch", preset="fast")
     for e in range(3):
         placed = zip((others[e], finger), where[e], strict=True)
         scene = cs.Scene([body.moved(cs.Pose(at[:3])) for body, at in placed])
@@ -339,7 +339,7 @@ def test_which_bodies_are_wide(sim):
 @pytest.mark.parametrize(
     ("name", "preset", "wide"),
     [
-        ("stripe", "learning", [0.05, 0.07]),  # electrodes 5 mm wide
+        ("stripe", "fast", [0.05, 0.07]),  # electrodes 5 mm wide
         ("stripe", "standard", [0.05, 0.07]),
         ("stripe", "fine", [0.05, 0.07]),
         ("six_patch_bare", "standard", []),  # 15 mm
@@ -559,7 +559,7 @@ def of_skin(matrix: np.ndarray) -> list[float]:
 @pytest.mark.parametrize(
     ("preset", "open_skin", "most"),
     [
-        ("learning", False, 0.12),
+        ("fast", False, 0.12),
         ("standard", False, 0.04),
         ("standard", True, 0.08),
         ("fine", False, 0.015),

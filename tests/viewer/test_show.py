@@ -112,5 +112,5 @@ def test_pictures_and_videos() -> None:
 
 def test_what_is_on_no_robot() -> None:
     """A simulator is shown by another command."""
-    with pytest.raises(cs.SceneError, match=r"sensor is of Simulator; .* capsense view"):
+    with pytest.raises(TypeError, match=r"sensor is of Simulator; .* capsense view"):
         cs.show(cs.Simulator("six_patch"), port=0)  # type: ignore[arg-type]

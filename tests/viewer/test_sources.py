@@ -132,8 +132,7 @@ class TestWatched:
             assert (two.index, one.index) == (1, 0)
             assert two.time > one.time
 
-            mine = cs.Simulator("six_patch")
-            mine.step(two.scene)
+            mine = cs.Simulator("six_patch").step(two.scene, keep_field=True)
             plane = Plane(source.green, region(source.design), 0, 0.0)
             np.testing.assert_array_equal(
                 source.potentials(two, plane), mine.potentials(plane.points)

@@ -135,8 +135,8 @@ def test_plane(server: Any) -> None:
     simulator = cs.Simulator("six_patch")
     stage = SceneDrawing(server, simulator.design)
     plane = Plane(simulator.background.green, region(simulator.design), 1, 0.0)
-    simulator.step(cs.Scene())
-    stage.show_plane(plane, simulator.potentials(plane.points)[:, 1])
+    reading = simulator.step(cs.Scene(), keep_field=True)
+    stage.show_plane(plane, reading.potentials(plane.points)[:, 1])
     lines = nodes_of(server)["/potential"]
     assert len(lines.points) > 1000
     assert np.abs(lines.points[..., 1].astype(float)).max() == 0
@@ -153,8 +153,7 @@ def test_charges(server: Any) -> None:
     x, y, _ = simulator.design.electrodes[1].surface.bounds.mean(axis=0)
     ball = cs.Body(cs.Sphere(0.02), cs.Pose((x, y, 0.04)), "steel", name="ball")
     scene = cs.Scene([ball])
-    simulator.step(scene)
-    charges = simulator.charges()
+    charges = simulator.step(scene, keep_field=True).charges()
     assert charges is not None
     stage.show_bodies(scene)
     stage.show_charges(charges, 1)
@@ -165,8 +164,7 @@ def test_charges(server: Any) -> None:
     darkest = points[np.argmin(cloud.colors.astype(int).sum(axis=1))]
     assert darkest[2] < 0.025
     assert nodes(server, "/names/") == ["/names/0"]
-    simulator.step(cs.Scene())
-    assert simulator.charges() is None
+    assert simulator.step(cs.Scene(), keep_field=True).charges() is None
     stage.show_charges(None, 1)
     assert "/charge" not in nodes_of(server)
 

@@ -9,6 +9,7 @@ Every adapter hands out an :class:`~capsense.adapters.AttachedSensor`. What they
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from abc import ABC, abstractmethod
@@ -45,12 +46,18 @@ class AttachedSensor(ABC):
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         """The sensor itself."""
-        self.readout: Readout | None = simulator.readout
-        """The chip that turns capacitances into counts, if any; a simulator's own is taken over."""
-        simulator.use_readout(None)
+        self.readout: Readout | None = copy.deepcopy(simulator.readout)
+        """The chip that turns capacitances into counts, if any; at first a copy of the simulator's,
+        which stays as it is."""
         self._one = ForkSafeRLock()
 
-    def read(self, time: float | None = None, view: Scene | DepthFrame | None = None) -> Reading:
+    def read(
+        self,
+        time: float | None = None,
+        view: Scene | DepthFrame | None = None,
+        *,
+        keep_field: bool = False,
+    ) -> Reading:
         """The reading of the simulator's present state.
 
         With a :attr:`readout`, the reading holds the conversions that have finished since the last
@@ -61,6 +68,7 @@ class AttachedSensor(ABC):
                 hysteresis; by default the simulator's own, where it tells it (MuJoCo does, PyBullet
                 does not).
             view: What :meth:`view` has just given, if that was asked already.
+            keep_field: As of :meth:`Simulator.step`.
 
         Raises:
             SceneError: The simulator has not been stepped yet, or has diverged, or a readout
@@ -71,7 +79,7 @@ class AttachedSensor(ABC):
         with self._one:
             world = self.view() if view is None else view
             now = self._now_or_given(time)
-            reading = self.simulator.step(world, time=now)
+            reading = self.simulator.solved(world, time=now, keep_field=keep_field)
             if self.readout is None or now is None:
                 return reading
             return replace(reading, counts=self.readout.sample(now, reading))
@@ -94,28 +102,40 @@ class AttachedSensor(ABC):
         except SceneError:
             return None
 
-    def use_readout(self, readout: Readout | str | Path | None) -> None:
-        """Read through a chip from now on: it starts at the simulator's time, or at 0 s.
+    def use_readout(
+        self,
+        readout: Readout | str | Path | None,
+        *,
+        start: float | None = None,
+        seed: int | None = None,
+    ) -> None:
+        """Read through a chip from now on. The simulator's own readout stays as it is.
 
         Args:
             readout: A readout of this sensor alone, the name of a chip with its usual settings,
                 the path of a readout file (``.toml``), or None.
+            start: Time at which it is switched on [s], by default the robot simulator's, or 0 where
+                that is not told.
+            seed: Of its noise, by default its own.
 
         Raises:
-            ReadoutError: There is no such chip or file, or the file is wrong.
+            ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
+                number from 0 on.
         """
-        self.readout = None if readout is None else make_readout(readout, self.simulator)
-        self._restart_readout(None)
+        self.readout = None
+        if readout is not None:
+            chip = make_readout(readout, self.simulator)
+            chip.reset(start=self._start(start), seed=seed)
+            self.readout = chip
 
-    def _restart_readout(self, seed: int | None) -> None:
-        """Switch the chip on anew, at the simulator's time, or at 0 s if that is not told."""
-        if self.readout is None:
-            return
+    def _start(self, start: float | None) -> float:
+        """When a chip is switched on [s]: as given, or at the simulator's time, or at 0 s."""
+        if start is not None:
+            return start
         try:
-            start = self._time()
+            return self._time()
         except SceneError:
-            start = 0.0
-        self.readout.reset(start=start, seed=seed)
+            return 0.0
 
     @property
     def time(self) -> float:
@@ -197,18 +217,21 @@ class AttachedSensor(ABC):
         """Electrode names in matrix order."""
         return self.simulator.electrode_names
 
-    def reset(self, seed: int | None = None) -> None:
-        """Forget the previous step, as after the simulator was set back; restart the readout.
+    def reset(self, *, start: float | None = None, seed: int | None = None) -> None:
+        """Forget the previous step, as after the simulator was set back; restart the chip.
 
         Args:
-            seed: Of the readout's noise from now on; by default its random numbers repeat.
+            start: Time at which it is switched on [s], by default the robot simulator's, or 0 where
+                that is not told.
+            seed: Of its noise from now on; by default its random numbers repeat.
 
         Raises:
             ReadoutError: The seed is no whole number from 0 on.
         """
         with self._one:
-            self.simulator.reset()
-            self._restart_readout(seed)
+            self.simulator.forget()
+            if self.readout is not None:
+                self.readout.reset(start=self._start(start), seed=seed)
 
 
 class DepthSensor(AttachedSensor):

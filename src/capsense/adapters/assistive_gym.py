@@ -14,10 +14,9 @@ from typing import Any, Literal, Unpack
 from capsense.adapters import AttachedSensor, make_simulator, pybullet, refuse_missing
 from capsense.adapters.pybullet_bodies import BODY_NAME, LINK_NAME
 from capsense.design.model import Design
-from capsense.errors import SceneError
 from capsense.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Simulator
+from capsense.simulator import DEFAULT_DESIGN, Simulator
 
 __all__ = ["AssistiveGymSensor", "attach", "limbs"]
 
@@ -43,7 +42,7 @@ def attach(
     agent: str = "robot",
     link: int | str | None = None,
     pose_in_link: Pose = Pose(),  # noqa: B008, it is immutable
-    design: Design | str | Path | Simulator = "six_patch",
+    design: Design | str | Path | Simulator = DEFAULT_DESIGN,
     *,
     perception: Literal["geometry", "depth_camera"] = "geometry",
     readout: Readout | str | Path | None = None,
@@ -66,14 +65,17 @@ def attach(
             that holds the tool, else the base.
         pose_in_link: The sensor frame in the link's frame (the URDF frame): origin at the centre
             of the electrode plane, z out of the sensor.
-        design: A design, a packaged name, a design file, or a ready simulator.
+        design: A design, a packaged name, a design file, or a ready simulator, whose readout stays
+            as it is.
         perception: As for :func:`capsense.adapters.pybullet.attach`.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`. By default a copy of the simulator's, if
+            it has one.
         options: As for :func:`capsense.adapters.pybullet.attach`: those of
             :class:`~capsense.adapters.pybullet.PybulletOptions`.
 
     Raises:
+        TypeError: ``env`` is no environment of Assistive Gym.
         SceneError: The environment was not reset, has no such agent or link, or as for
             :func:`capsense.adapters.pybullet.attach`.
         DesignError: The design is wrong.
@@ -81,7 +83,7 @@ def attach(
     """
     env = getattr(env, "unwrapped", env)
     if not hasattr(env, "agents") or not hasattr(env, "id"):
-        raise SceneError(
+        raise TypeError(
             f"env is a {type(env).__name__}; give an environment of Assistive Gym 1.0 or later"
         )
     simulator = make_simulator(design)

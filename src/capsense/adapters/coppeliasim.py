@@ -42,7 +42,7 @@ from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
 from capsense.scene.materials import Grounding
 from capsense.scene.pose import checked_pose
-from capsense.simulator import Simulator
+from capsense.simulator import DEFAULT_DESIGN, Simulator
 
 __all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]
 
@@ -111,7 +111,7 @@ class CoppeliaOptions(SeenOptions, ImageOptions, total=False):
 def attach(
     sim: Any,
     object: int | str,
-    design: Design | str | Path | Simulator = "six_patch",
+    design: Design | str | Path | Simulator = DEFAULT_DESIGN,
     *,
     pose_in_object: Pose | None = None,
     readout: Readout | str | Path | None = None,
@@ -135,12 +135,14 @@ def attach(
     Args:
         sim: What :func:`connect` or ``client.require("sim")`` returned.
         object: The object that carries the sensor, by its path or handle.
-        design: A design, a packaged name, a design file, or a ready simulator.
+        design: A design, a packaged name, a design file, or a ready simulator, whose readout stays
+            as it is.
         pose_in_object: The sensor frame in the object's frame, by default that frame itself:
             origin at the centre of the electrode plane, z out of the sensor. A vision sensor of
             the scene's own is itself the sensor frame.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`. By default a copy of the simulator's, if
+            it has one.
         options: What is seen and what it is made of: ``materials``, ``exclude`` and the others of
             :class:`~capsense.adapters.rules.SeenOptions`; ``size``, ``resolution`` and ``back`` of
             :class:`~capsense.adapters.rules.ImageOptions`.

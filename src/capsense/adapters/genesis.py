@@ -22,6 +22,7 @@ from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.fleet import FleetReading
 from capsense.scene import Shape
+from capsense.simulator import DEFAULT_DESIGN
 
 _ORDER = [1, 2, 3, 0]
 """From quaternions (w, x, y, z) to (x, y, z, w)."""
@@ -62,7 +63,7 @@ class GenesisSensors(ParallelSensors):
         self,
         scene: Any,
         sites: Sequence[LinkSite],
-        design: Design | str | Path = "six_patch",
+        design: Design | str | Path = DEFAULT_DESIGN,
         **options: Unpack[FleetOptions],
     ) -> None:
         rules, other = split_rules(options, FleetOptions)
@@ -135,7 +136,7 @@ class Capacitance(
     what Genesis's own options for noise and delay make of it.
     """
 
-    design: Any = "six_patch"
+    design: Any = DEFAULT_DESIGN
     """A design, its name, or the path of its file."""
     options: dict[str, Any] = {}  # noqa: RUF012 - pydantic copies it
     """Those of :class:`~capsense.adapters.parallel.FleetOptions`."""

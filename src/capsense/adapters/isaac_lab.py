@@ -15,6 +15,7 @@ from isaaclab_newton.physics import NewtonManager
 
 from capsense.adapters.newton import SensorCapacitance
 from capsense.errors import SceneError
+from capsense.simulator import DEFAULT_DESIGN
 
 
 @dataclass
@@ -108,7 +109,7 @@ class CapacitiveSensorCfg(SensorBaseCfg):
     """Configuration of :class:`CapacitiveSensor`."""
 
     class_type: type = CapacitiveSensor
-    design: Any = "six_patch"
+    design: Any = DEFAULT_DESIGN
     """A design, its name, or the path of its file."""
     offsets: list = field(
         default_factory=lambda: [((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]

@@ -10,6 +10,7 @@ import torch
 from mjlab.sensor import Sensor, SensorCfg
 
 from capsense.adapters.mujoco_warp import CapacitiveSensors
+from capsense.simulator import DEFAULT_DESIGN
 
 
 @dataclass
@@ -18,7 +19,7 @@ class CapacitanceCfg(SensorCfg):
 
     sites: tuple[str, ...] = ()
     """Names of the sites, with those of their entities: ``"robot/pad"``."""
-    design: Any = "six_patch"
+    design: Any = DEFAULT_DESIGN
     """A design, its name, or the path of its file."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Those of :class:`~capsense.adapters.mujoco_warp.WarpOptions`."""

@@ -21,7 +21,7 @@ from capsense.errors import SceneError, listed, require_package
 from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.scene.pose import checked_pose
-from capsense.simulator import Simulator
+from capsense.simulator import DEFAULT_DESIGN, Simulator
 from capsense.skin import AnyDesign
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def attach(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     site: str,
-    design: Design | str | Path | Simulator = "six_patch",
+    design: Design | str | Path | Simulator = DEFAULT_DESIGN,
     *,
     perception: Literal["geometry", "depth_camera"] = "geometry",
     readout: Readout | str | Path | None = None,
@@ -106,16 +106,20 @@ def attach(
         model: The model.
         data: Its state.
         site: Name of the site that carries the sensor.
-        design: A design, a packaged name, a design file, or a ready simulator.
+        design: A design, a packaged name, a design file, or a ready simulator, whose readout stays
+            as it is.
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, the image of a
             camera.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`. By default a copy of the simulator's, if
+            it has one.
         options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
             the others of :class:`MujocoOptions`.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
+        TypeError: ``model`` or ``data`` is something else, or there is no such option.
+        ValueError: There is no such kind of perception.
         SceneError: There is no such site or camera, a pattern fits nothing, a shape is not
             supported, the camera is not orthographic or nothing reads it, the data belong to
             another model, or an option belongs to the other kind of perception.
@@ -146,9 +150,9 @@ def attach_skin(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     sites: Sequence[str],
-    design: AnyDesign | Mapping[str, AnyDesign] = "arm_segment",
+    design: AnyDesign | Mapping[str, AnyDesign] = DEFAULT_DESIGN,
     *,
-    readout: str | Path | None = None,
+    readout: Readout | str | Path | None = None,
     threads: int | None = None,
     **options: Unpack[MujocoSkinOptions],
 ) -> AttachedSkin:
@@ -163,12 +167,17 @@ def attach_skin(
         sites: Names of the sites, which are also those of the readings.
         design: What :func:`attach` takes, for all sites, or site → design. A simulator that is
             given for several sites stands for its own design.
-        readout: Name of the chip behind every sensor, or the path of a readout file.
+        readout: Of which every sensor has a chip of its own, see
+            :meth:`~capsense.adapters.skin.AttachedSkin.use_readout`; by default that of the
+            simulator, if one is given.
         threads: How many threads read; by default as many as the process may use processors.
         options: As for :func:`attach`: those of :class:`MujocoSkinOptions`.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
+        TypeError: ``model`` or ``data`` is something else, ``sites`` is a single name, or there is
+            no such option.
+        ValueError: ``threads`` is not a positive whole number.
         SceneError: There is no such site, a pattern fits nothing, a shape is not supported, or
             the data belong to another model.
         DesignError: A design is wrong.
@@ -178,7 +187,7 @@ def attach_skin(
     _check_pair(model, data)
     rules, other = split_rules(options, MujocoSkinOptions)
     if isinstance(sites, str):
-        raise SceneError(f"sites is {sites!r}; give a list of names, like [{sites!r}]")
+        raise TypeError(f"sites is {sites!r}; give a list of names, like [{sites!r}]")
     numbers = {site: find_site(model, site) for site in sites}
     source = ModelSource(model, data, rules, other.get("groups"))
     simulators = simulators_of(sites, design)
@@ -342,13 +351,14 @@ def add_sensor(
         ``name``, as :func:`attach` takes it.
 
     Raises:
+        TypeError: ``spec`` is not an ``MjSpec``.
         SceneError: There is no such body, the name is taken, or something is of the wrong kind
             or out of range.
     """
     import mujoco
 
     if not isinstance(spec, mujoco.MjSpec):
-        raise SceneError(
+        raise TypeError(
             f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, such as "
             "mujoco.MjSpec.from_file(path)"
         )
@@ -393,9 +403,9 @@ def _check_pair(model: Any, data: Any) -> None:
     import mujoco
 
     if not isinstance(model, mujoco.MjModel):
-        raise SceneError(f"model is a {type(model).__name__}; give a mujoco.MjModel")
+        raise TypeError(f"model is a {type(model).__name__}; give a mujoco.MjModel")
     if not isinstance(data, mujoco.MjData):
-        raise SceneError(f"data is a {type(data).__name__}; give a mujoco.MjData")
+        raise TypeError(f"data is a {type(data).__name__}; give a mujoco.MjData")
     if (len(data.xpos), len(data.site_xpos)) != (model.nbody, model.nsite):
         raise SceneError(
             f"the data belong to another model ({len(data.xpos)} bodies, not {model.nbody}); "

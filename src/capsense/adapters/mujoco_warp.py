@@ -22,6 +22,7 @@ from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
 from capsense.fleet import FleetReading
 from capsense.scene import Body, Pose, Shape
+from capsense.simulator import DEFAULT_DESIGN
 
 if TYPE_CHECKING:
     import mujoco
@@ -58,7 +59,7 @@ class CapacitiveSensors(ParallelSensors):
         model: mujoco.MjModel,
         data: Any,
         sites: str | Sequence[str],
-        design: Design | str | Path = "six_patch",
+        design: Design | str | Path = DEFAULT_DESIGN,
         **options: Unpack[WarpOptions],
     ) -> None:
         rules, other = split_rules(options, WarpOptions)

@@ -24,6 +24,7 @@ from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Body, Shape
+from capsense.simulator import DEFAULT_DESIGN
 
 
 class SensorCapacitance(ParallelSensors):
@@ -52,7 +53,7 @@ class SensorCapacitance(ParallelSensors):
         self,
         model: Any,
         sites: str | Sequence[str],
-        design: Design | str | Path = "six_patch",
+        design: Design | str | Path = DEFAULT_DESIGN,
         **options: Unpack[FleetOptions],
     ) -> None:
         from newton import ShapeFlags

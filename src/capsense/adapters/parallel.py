@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
-from capsense.fleet import Fleet, FleetReading, Preset
+from capsense.fleet import Fleet, FleetReading
 from capsense.scene import Body
+from capsense.simulator import PresetName
 from capsense.solver.tree.matter import matter_of
 
 Fixed = tuple[NDArray[np.integer], NDArray[np.floating]]
@@ -32,7 +33,7 @@ class FleetOptions(AttachOptions, total=False):
 
     device: str | None
     """As of a :class:`~capsense.fleet.Fleet`; by default that of the simulator's arrays."""
-    preset: Preset
+    preset: PresetName
     budget: int
     """Accuracy on the CPU and on Warp, as of a fleet."""
 

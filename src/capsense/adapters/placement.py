@@ -83,7 +83,7 @@ def felt(simulator: Simulator, scene: Scene, found: list[str]) -> list[str]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # findings tell of contacts
-            reading = simulator.step_batch([scene], threads=1)[0]
+            reading = simulator.solved_batch([scene], threads=1)[0]
     except CapSenseError:  # which a reading will raise, too
         return found
     change, error = float(np.abs(reading.delta).max()), reading.stats.solver_error

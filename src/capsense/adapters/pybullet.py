@@ -38,7 +38,7 @@ from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
 from capsense.scene.pose import checked_pose
-from capsense.simulator import Simulator
+from capsense.simulator import DEFAULT_DESIGN, Simulator
 from capsense.skin import AnyDesign
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ def attach(
     body: int,
     link: int | str = -1,
     pose_in_link: Pose = _NO_POSE,
-    design: Design | str | Path | Simulator = "six_patch",
+    design: Design | str | Path | Simulator = DEFAULT_DESIGN,
     *,
     perception: Literal["geometry", "depth_camera"] = "geometry",
     readout: Readout | str | Path | None = None,
@@ -111,15 +111,19 @@ def attach(
         link: Its link, by index or name; -1 is the base.
         pose_in_link: The sensor frame in the link's frame (the URDF frame, not the centre of
             mass): origin at the centre of the electrode plane, z out of the sensor.
-        design: A design, a packaged name, a design file, or a ready simulator.
+        design: A design, a packaged name, a design file, or a ready simulator, whose readout stays
+            as it is.
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, a rendered image.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`. By default a copy of the simulator's, if
+            it has one.
         options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
             the others of :class:`PybulletOptions`.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
+        TypeError: There is no such option.
+        ValueError: There is no such kind of perception or of shapes.
         SceneError: There is no such client, body or link, a pattern fits nothing, a shape is
             not supported, or an option is out of range or belongs to the other kind of perception.
         DesignError: The design is wrong.
@@ -149,9 +153,9 @@ def attach_skin(
     client: Any,
     body: int,
     mounts: Mapping[str, tuple[int | str, Pose]],
-    design: AnyDesign | Mapping[str, AnyDesign] = "arm_segment",
+    design: AnyDesign | Mapping[str, AnyDesign] = DEFAULT_DESIGN,
     *,
-    readout: str | Path | None = None,
+    readout: Readout | str | Path | None = None,
     threads: int | None = None,
     **options: Unpack[PybulletSkinOptions],
 ) -> AttachedSkin:
@@ -166,12 +170,16 @@ def attach_skin(
         mounts: Name → link, by index or name, and the sensor frame in the link's frame.
         design: What :func:`attach` takes, for all sensors, or name → design. A simulator that is
             given for several sensors stands for its own design.
-        readout: Name of the chip behind every sensor, or the path of a readout file.
+        readout: Of which every sensor has a chip of its own, see
+            :meth:`~capsense.adapters.skin.AttachedSkin.use_readout`; by default that of the
+            simulator, if one is given.
         threads: How many threads read; by default as many as the process may use processors.
         options: As for :func:`attach`: those of :class:`PybulletSkinOptions`.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
+        TypeError: There is no such option.
+        ValueError: There are no such shapes, or ``threads`` is not a positive whole number.
         SceneError: There is no such client, body or link, a pattern fits nothing, or a shape is
             not supported.
         DesignError: A design is wrong.
@@ -302,7 +310,7 @@ class PybulletDepthSensor(DepthSensor):
 
 def _checked_shapes(shapes: str) -> str:
     if shapes not in ("collision", "visual"):
-        raise SceneError(f'shapes is {shapes!r}; choose "collision" or "visual"')
+        raise ValueError(f'shapes is {shapes!r}; choose "collision" or "visual"')
     return shapes
 
 

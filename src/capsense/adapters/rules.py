@@ -167,10 +167,11 @@ def check_perception(
         only: Names of the options that only ``"geometry"`` has, or only ``"depth_camera"``.
 
     Raises:
-        SceneError: The first thing that is wrong.
+        ValueError: There is no such kind of perception.
+        SceneError: An option belongs to the other kind.
     """
     if perception not in ("geometry", "depth_camera"):
-        raise SceneError(f'perception is {perception!r}; choose "geometry" or "depth_camera"')
+        raise ValueError(f'perception is {perception!r}; choose "geometry" or "depth_camera"')
     other = "geometry" if perception == "depth_camera" else "depth_camera"
     for name in only[other]:
         usual = DEFAULTS.get(name)

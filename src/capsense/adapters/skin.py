@@ -10,12 +10,12 @@ from capsense._thread_pool import ForkSafeRLock, ThreadPool
 from capsense._validate import suggest
 from capsense.adapters import GeometrySensor
 from capsense.adapters.placement import blind
-from capsense.errors import ReadoutError, SceneError, listed
+from capsense.errors import SceneError, listed
 from capsense.reading import Reading
-from capsense.readout import SEED_STRIDE, Readout
+from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.simulator import Simulator
-from capsense.skin import AnyDesign, make_simulators, read_all
+from capsense.skin import AnyDesign, make_simulators, read_all, reset_all, use_readouts
 
 
 class AttachedSkin:
@@ -25,31 +25,29 @@ class AttachedSkin:
 
     Args:
         sensors: Name → sensor; they share one source of their world.
-        readout: Name of the chip behind every sensor, the path of a readout file, or None. Each
-            has noise of its own, see :meth:`reset`.
+        readout: What :meth:`use_readout` takes; None for what the sensors have already.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
-        SceneError: ``threads`` is not a positive whole number.
+        ValueError: ``threads`` is not a positive whole number.
         ReadoutError: There is no such chip or file, or the file is wrong.
     """
 
     def __init__(
-        self, sensors: Mapping[str, GeometrySensor], readout: str | Path | None, threads: int | None
+        self,
+        sensors: Mapping[str, GeometrySensor],
+        readout: Readout | str | Path | None,
+        threads: int | None,
     ) -> None:
-        if isinstance(readout, Readout):
-            raise ReadoutError(
-                f"{readout!r} would be shared by all sensors; give a chip's name or a file"
-            )
         self.sensors = dict(sensors)
         """The sensors, as ``attach`` makes them."""
         self._source = next(iter(self.sensors.values())).source
         self._pool, self._one = ThreadPool(threads), ForkSafeRLock()
-        for sensor in self.sensors.values():
-            sensor.use_readout(readout)
-        first = next(iter(self.sensors.values())).readout
-        if first is not None:
-            self.reset(first.seed)
+        if readout is None:
+            for sensor in self.sensors.values():
+                sensor.use_readout(sensor.readout)
+        else:
+            self.use_readout(readout)
 
     def read(self, time: float | None = None) -> dict[str, Reading]:
         """The readings of the simulator's present state, by name.
@@ -119,19 +117,44 @@ class AttachedSkin:
             for sensor in self.sensors.values():
                 sensor.catch_up()
 
-    def reset(self, seed: int | None = None) -> None:
-        """Forget the previous step, as after the simulator was set back; restart readouts.
+    def use_readout(
+        self,
+        readout: Readout | str | Path | None,
+        *,
+        start: float | None = None,
+        seed: int | None = None,
+    ) -> None:
+        """Read every sensor through a chip of its own from now on.
 
         Args:
-            seed: Of the first sensor's readout; those of the others follow at steps of 2³², so
-                that noise is not shared. By default all random numbers repeat.
+            readout: A readout, which stays as it is, the name of a chip with its usual settings,
+                the path of a readout file (``.toml``), or None.
+            start: Time at which they are switched on [s], by default the robot simulator's, or 0
+                where that is not told.
+            seed: Of the first sensor's noise, by default its own; those of the others follow at
+                steps of 2³², so that noise is not shared.
+
+        Raises:
+            ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
+                number from 0 on.
+        """
+        with self._one:
+            use_readouts(self.sensors, readout, start, seed)
+
+    def reset(self, *, start: float | None = None, seed: int | None = None) -> None:
+        """Forget the previous step, as after the simulator was set back; restart the chips.
+
+        Args:
+            start: Time at which they are switched on [s], by default the robot simulator's, or 0
+                where that is not told.
+            seed: Of the first sensor's noise from now on, as of :meth:`use_readout`; by default all
+                random numbers repeat.
 
         Raises:
             ReadoutError: The seed is no whole number from 0 on.
         """
         with self._one:
-            for number, sensor in enumerate(self.sensors.values()):
-                sensor.reset(None if seed is None else seed + number * SEED_STRIDE)
+            reset_all(self.sensors, start, seed)
 
     def __len__(self) -> int:
         return len(self.sensors)

@@ -102,7 +102,7 @@ def sheet_on_face(design: Design, name: str) -> Surface:
     return next(e.surface for e in design.electrodes if e.name == name)
 
 
-class Plane(NamedTuple):
+class FacePlane(NamedTuple):
     """Panels of a plane in front of a design that can be moved away from it."""
 
     panels: Panels
@@ -144,7 +144,7 @@ class Plane(NamedTuple):
         )  # fmt: skip
 
 
-def plane_panels(solution: BoundarySolution, reach: float) -> Plane:
+def plane_panels(solution: BoundarySolution, reach: float) -> FacePlane:
     """Panels of a plane that follow the outlines of the sheets behind it.
 
     Above the electrodes they are the electrodes' own, so that no panel lies across a rim.
@@ -203,8 +203,8 @@ def plane_panels(solution: BoundarySolution, reach: float) -> Plane:
     add(rest, off, rest.bounds)
     panels = concatenate(parts)
     if film is None:
-        return Plane(panels)
-    return Plane(panels, tuple(bent), np.repeat(np.arange(len(bent)), counts), film.radius)
+        return FacePlane(panels)
+    return FacePlane(panels, tuple(bent), np.repeat(np.arange(len(bent)), counts), film.radius)
 
 
 def _sheets_of(solution: BoundarySolution) -> list[tuple[Facet, Grading]]:

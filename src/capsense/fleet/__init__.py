@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,14 +32,17 @@ from capsense.fleet.bodies import (
     require_no_gradient,
 )
 from capsense.fleet.cpu import CpuCore
+from capsense.reading import Reading, StepStats
 from capsense.readout import Readout
+from capsense.readout.config import make_readout
 from capsense.readout.conversions import SideBySide
 from capsense.scene import Body, Pose, Scene
-from capsense.simulator import Simulator
+from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator, checked_preset
 from capsense.solver.surface_solver import PRESETS, SurfaceSolver
 from capsense.solver.tree.fine_panels import WIDE
 
 if TYPE_CHECKING:
+    from capsense.fleet.warp_chips import WarpChips
     from capsense.fleet.warp_core import WarpCore
 
 Array = NDArray[np.float64]
@@ -47,8 +51,6 @@ __all__ = ["Fleet", "FleetCheck", "FleetReading", "FleetTouch"]
 
 _PANELS = 5
 """Panels of a shape for each cluster that a body is cut into on Warp."""
-
-Preset = Literal["standard", "learning", "fine"]
 
 
 class Fleet:
@@ -70,16 +72,15 @@ class Fleet:
         sensors: How many sensors of the design each has, s.
         device: ``"cpu"`` for the compiled core on all processors, or a device of Warp:
             ``"cuda:0"``, or ``"warp:cpu"``, which is for tests.
-        preset: Accuracy on the CPU, as of :class:`Simulator`, whose own default is
-            ``"standard"``.
+        preset: Accuracy on the CPU, as of :class:`Simulator`.
         budget: Clusters of each body on Warp: 32, 64 or 128.
         excitation_frequency: Excitation frequency [Hz].
 
     Raises:
         DesignError: The design is wrong.
-        SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have;
-            or a count is not a positive whole number.
-        ValueError: There is no such preset, budget or device, or the frequency is not positive.
+        SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have.
+        ValueError: There is no such preset, budget or device, or the frequency or a count is not
+            positive.
         MissingDependencyError: Warp is asked for and not installed.
     """
 
@@ -91,30 +92,28 @@ class Fleet:
         *,
         sensors: int = 1,
         device: str = "cpu",
-        preset: Preset = "learning",
+        preset: PresetName = DEFAULT_PRESET,
         budget: int = 64,
         excitation_frequency: float = 250e3,
     ) -> None:
         for what, number in (("count", count), ("sensors", sensors)):
             if (as_whole(number) or 0) < 1:
-                raise SceneError(f"{what} is {number!r}; give a whole number from 1")
+                raise ValueError(f"{what} is {number!r}; give a whole number from 1")
         count, sensors = int(count), int(sensors)
         self.excitation_frequency = checked_frequency(excitation_frequency)
         given, bodies = bodies, list(bodies) if isinstance(bodies, Iterable) else []
         if not bodies or not all(isinstance(body, Body) for body in bodies):
             raise SceneError(f"bodies is {shorten(given)}; give a list of at least one Body")
-        for what, chosen, known in (
-            ("preset", preset, tuple(PRESETS)), ("budget", budget, (32, 64, 128)),
-        ):  # fmt: skip
-            if chosen not in known:
-                raise ValueError(f"{what} is {shorten(chosen)}; choose one of {known}")
+        preset = checked_preset(preset)
+        if budget not in (32, 64, 128):
+            raise ValueError(f"budget is {shorten(budget)}; choose one of 32, 64, 128")
         self.design = design if isinstance(design, Design) else load_design(design)
         self.count, self.sensors, self.places = count, sensors, len(bodies)
         """How many environments, sensors in each, and places for bodies."""
         self.device = device
         field = load_or_build(self.design, default_settings(self.design))
         chosen_preset = PRESETS[preset]
-        finer: dict[Preset, Preset] = {"learning": "standard", "standard": "fine"}
+        finer: dict[PresetName, PresetName] = {"fast": "standard", "standard": "fine"}
         self.finer = finer.get(preset) if device == "cpu" else "fine"
         if device != "cpu":
             chosen_preset = replace(
@@ -129,9 +128,11 @@ class Fleet:
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self.table = BodyTable(self._solver, count, len(bodies), sensors)
+        self.readout: Readout | None = None
+        """The readout of which every sensor has a chip, if any."""
         self._chips: Any = None
         self._one, self._warned = ForkSafeRLock(), False
-        self._cpu = CpuCore(self._solver, self._terminals, self.table)
+        self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
             self.change(place, body)
@@ -234,33 +235,79 @@ class Fleet:
             shapes = cast("list[Any]", self.table.shapes)
             self._warp.take(self.table.bodies, shapes, self.table.forces)
 
-    def use_readout(self, readout: Readout | str | None, *, seed: int = 0) -> None:
+    @property
+    def empty(self) -> Reading:
+        """The reading of a sensor in an empty environment, which no chip has seen."""
+        total, n = self._terminals.empty, self._terminals.electrodes
+        coupling = total[:n, n:].sum(axis=1)
+        nothing = np.zeros_like(self.baseline)
+        stats = StepStats(0.0, 0.0)
+        return Reading(self.baseline.copy(), nothing, stats, self.electrode_names, coupling)
+
+    def use_readout(
+        self,
+        readout: Readout | str | Path | None,
+        *,
+        start: float | None = None,
+        seed: int | None = None,
+    ) -> None:
         """Read every sensor through a chip of its own from now on.
 
-        All are switched on together, at 0 s; noise differs from chip to chip.
+        All are switched on together; noise differs from chip to chip.
 
         Args:
-            readout: A readout for this design's electrodes, the name of a chip, or None.
-            seed: Of all random numbers.
+            readout: A readout for this design's electrodes, which stays as it is, the name of a
+                chip with its usual settings, the path of a readout file (``.toml``), or None.
+            start: Time at which they are switched on [s], by default 0; always 0 on Warp.
+            seed: Of all random numbers, by default the readout's own.
 
         Raises:
-            ReadoutError: There is no such chip, or the readout is of other electrodes; or it has
-                open electrodes or parts of the user's own, and the fleet is on Warp.
+            ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
+                number from 0 on; the readout is of other electrodes; or it has open electrodes or
+                parts of the user's own, or is not switched on at 0 s, and the fleet is on Warp.
         """
-        self._chips = None
+        self.readout = self._chips = None
         if readout is None:
             return
-        if isinstance(readout, str):
-            readout = Readout.preset(readout, self.electrode_names)
-        if readout.bank.electrodes != self.electrode_names:
+        chip = copy.deepcopy(make_readout(readout, self))
+        if chip.bank.electrodes != self.electrode_names:
             raise ReadoutError(
-                f"the readout is of electrodes {readout.bank.electrodes}, the fleet of "
+                f"the readout is of electrodes {chip.bank.electrodes}, the fleet of "
                 f"{self.electrode_names}"
             )
-        if self._warp is None:
-            self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
-        else:
-            self._chips = self._warp.chips(readout, self.baseline, seed)
+        self._switch_on(chip, start, seed)
+
+    def reset(self, *, start: float | None = None, seed: int | None = None) -> None:
+        """Restart the chips; a fleet keeps nothing else from step to step.
+
+        Args:
+            start: Time at which they are switched on [s], by default 0; always 0 on Warp.
+            seed: Of all random numbers from now on; by default they repeat.
+
+        Raises:
+            ReadoutError: The seed is no whole number from 0 on, or chips on Warp are not switched
+                on at 0 s.
+        """
+        if self.readout is not None:
+            self._switch_on(self.readout, start, seed)
+
+    def _switch_on(self, chip: Readout, start: float | None, seed: int | None) -> None:
+        """Make chips of one kind, switched on at a time [s]."""
+        begun = 0.0 if start is None else start
+        chip.reset(start=begun, seed=seed)
+        with self._one:
+            chips: SideBySide | WarpChips
+            if self._warp is None:
+                chips = SideBySide(chip, self.count * self.sensors, seed=chip.seed)
+                chips.reset(start=begun)
+            elif begun != 0.0:
+                raise ReadoutError(
+                    f"start is {begun:g} s, but chips on Warp are switched on at 0 s; leave it out "
+                    "and let the fleet's time begin at 0"
+                )
+            else:
+                chips = self._warp.chips(chip, self.baseline, chip.seed)
+            self.readout, self._chips = chip, chips
 
     def step(
         self,
@@ -367,7 +414,8 @@ class Fleet:
         core = self._warp
         core.solve(where, at, None if forces is None else held)
         return FleetReading(
-            core.capacitance, core.delta, core.error, shield_coupling=core.shields,
+            core.capacitance, core.delta, self.electrode_names, core.error,
+            shield_coupling=core.shields,
             conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
             touch=core.touch,
         )  # fmt: skip
@@ -382,7 +430,7 @@ class Fleet:
     ) -> FleetCheck:
         """Compare some environments with a ``Simulator`` of a finer preset.
 
-        That is ``"fine"``; of a fleet on the CPU with the preset ``"learning"``, ``"standard"``. A
+        That is ``"fine"``; of a fleet on the CPU with the preset ``"fast"``, ``"standard"``. A
         simulator joins the conductors that touch each other, and no others. If places are joined,
         the comparison is with a finer fleet on the CPU, where the same places are. On Warp, the
         arrays of the last reading are written anew.
@@ -394,8 +442,9 @@ class Fleet:
             seed: Of the draw.
 
         Raises:
-            SceneError: As by :meth:`step`, or ``samples`` is not a whole number from 1.
-            ValueError: The fleet has the preset ``"fine"``, and there is no finer one.
+            SceneError: As by :meth:`step`.
+            ValueError: The fleet has the preset ``"fine"``, and there is no finer one; or
+                ``samples`` is not a whole number from 1.
             SolveError: As by :meth:`step`.
         """
         return compare(self, poses, sensors, samples, seed)

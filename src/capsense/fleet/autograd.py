@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from capsense.errors import SceneError
 from capsense.fleet import Fleet
 
 
@@ -27,13 +26,14 @@ def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = Non
         Shape (e, s, n, n) [F], of the precision of ``poses``.
 
     Raises:
+        TypeError: Poses are no tensors.
         SceneError: As by :meth:`Fleet.step`.
         SolveError: As by :meth:`Fleet.step`.
         ValueError: Gradients by the sensors' poses are asked for.
     """
     for what, values in (("poses", poses), ("sensors", sensors)):
         if not isinstance(values, torch.Tensor | None):
-            raise SceneError(
+            raise TypeError(
                 f"{what} is of {type(values).__name__}; give a tensor, such as "
                 f"torch.tensor({what}, requires_grad=True)"
             )

@@ -14,7 +14,7 @@ from capsense._validate import as_whole, shorten
 from capsense.errors import SceneError
 from capsense.readout.conversions import Held
 from capsense.scene import Body, Layers, Pose, Scene, SurfaceMesh
-from capsense.simulator import Simulator
+from capsense.simulator import PresetName, Simulator
 from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import windowed
 from capsense.solver.surface_solver import SurfaceSolver
@@ -23,7 +23,7 @@ from capsense.solver.tree.matter import matter_of
 from capsense.solver.tree.rigid import BODY, RigidShape
 
 if TYPE_CHECKING:
-    from capsense.fleet import Fleet, Preset
+    from capsense.fleet import Fleet
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,7 @@ class FleetReading:
     """Maxwell capacitance matrices [F], shape (e, s, n, n)."""
     delta: Any
     """Their change by the bodies [F], shape (e, s, n, n)."""
+    electrode_names: tuple[str, ...]
     error: Any = None
     """Estimated error of the largest entry [F], shape (e, s)."""
     shield_coupling: Any = None
@@ -61,6 +62,21 @@ class FleetReading:
 
     touch: FleetTouch | None = None
     """What is pressed onto the cover, if the design has one; without relaxation and hysteresis."""
+
+    @property
+    def self_capacitance(self) -> Array:
+        """As of :class:`Reading` [F], shape (e, s, n); copied from the device."""
+        own = np.diagonal(_on_host(self.capacitance), axis1=-2, axis2=-1)
+        if self.shield_coupling is None:
+            return own.copy()
+        return np.asarray(own + _on_host(self.shield_coupling))
+
+    @property
+    def mutual_capacitance(self) -> Array:
+        """As of :class:`Reading` [F], shape (e, s, n, n); copied from the device."""
+        out = -_on_host(self.capacitance)
+        out[..., range(out.shape[-1]), range(out.shape[-1])] = 0.0
+        return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +113,11 @@ class FleetCheck:
     that are not at ground are near.
     Gaps between bodies that Warp does not resolve are part of ``rms`` and ``worst``.
     """
+
+
+def _on_host(values: Any) -> Any:
+    """An array of NumPy with the same numbers."""
+    return values if isinstance(values, np.ndarray) else values.numpy()
 
 
 def on_device(values: Any) -> bool:
@@ -315,7 +336,7 @@ def compare(
         )
     whole = as_whole(samples)
     if whole is None or whole < 1:
-        raise SceneError(f"samples is {shorten(samples)}; give a whole number from 1")
+        raise ValueError(f"samples is {shorten(samples)}; give a whole number from 1")
     e, s, b = fleet.count, fleet.sensors, fleet.places
     where = checked_poses("poses", poses, (e, b, 7))
     at = np.broadcast_to(WORLD, (e, s, 7))
@@ -342,7 +363,7 @@ def compare(
 
 
 def _by_simulator(
-    fleet: Fleet, preset: Preset, rows: NDArray[np.int64], where: Array, at: Array
+    fleet: Fleet, preset: PresetName, rows: NDArray[np.int64], where: Array, at: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Changes of the matrices in some environments [F], and where bodies touch electrodes."""
     simulator = Simulator(
@@ -368,7 +389,7 @@ def _by_simulator(
 
 
 def _by_fleet(
-    fleet: Fleet, preset: Preset, rows: NDArray[np.int64], where: Array, at: Array
+    fleet: Fleet, preset: PresetName, rows: NDArray[np.int64], where: Array, at: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """The same by a finer fleet, whose places are joined alike."""
     given, known = fleet.table.given[rows], fleet.table.bodies

@@ -268,10 +268,18 @@ class CpuCore:
         solver: Knows the design and how finely scenes are resolved.
         terminals: Of the design.
         table: What stands where.
+        names: Of the electrodes.
     """
 
-    def __init__(self, solver: SurfaceSolver, terminals: Terminals, table: BodyTable) -> None:
+    def __init__(
+        self,
+        solver: SurfaceSolver,
+        terminals: Terminals,
+        table: BodyTable,
+        names: tuple[str, ...],
+    ) -> None:
         self._solver, self._terminals, self._table = solver, terminals, table
+        self._names = names
 
     def step(self, bodies: Array, sensors: Array, forces: Array, jacobian: bool) -> FleetReading:
         """The reading of poses, shapes (e, b, 7) and (e, s, 7), and forces [N], shape (e, b).
@@ -310,7 +318,8 @@ class CpuCore:
         change = change[..., :n, :n]
         omega = 2 * np.pi * solver.excitation_frequency
         return FleetReading(
-            terminals.empty[:n, :n] + change.real, change.real, unit * found.error, shields,
+            terminals.empty[:n, :n] + change.real, change.real, self._names, unit * found.error,
+            shields,
             conductance=None if loss is None else -omega * change.imag, jacobian=slopes,
             touch=FleetTouch(found.force, solver.length * found.deepest, found.total)
             if own[2] else None,

@@ -27,7 +27,7 @@ from capsense.errors import DesignError, FieldError, ScenarioError
 from capsense.field.background import BuildSettings, build_background
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator
 from capsense.scenario import ScenarioTable as Table
-from capsense.simulator import PresetName, Simulator
+from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator
 
 Array = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ class DesignTask:
         return parse_design(self.content(values), source=self.name, folder=self.folder)
 
     def bound(
-        self, values: Array, resolution: float | None = None, preset: PresetName = "standard"
+        self, values: Array, resolution: float | None = None, preset: PresetName = DEFAULT_PRESET
     ) -> Bound:
         """Judge one candidate.
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.random import Generator
@@ -31,7 +31,7 @@ from capsense.scenario import (
     read_pose,
 )
 from capsense.scene import Body, Pose, Scene
-from capsense.simulator import PresetName, Simulator
+from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator, checked_preset
 
 TOP_KEYS = (
     "name", "description", "design", "scenes", "shard_size", "seed", "preset", "readout",
@@ -275,7 +275,7 @@ def load_spec(path: str | Path) -> Spec:
         count=top.integer("scenes", 1, 10**9),
         shard_size=top.integer("shard_size", 1, 10**6, 1000),
         seed=top.integer("seed", 0, 2**63 - 1, 0),
-        preset=cast("PresetName", top.choice("preset", get_args(PresetName), "standard")),
+        preset=checked_preset(top.choice("preset", get_args(PresetName), DEFAULT_PRESET)),
         readout=top.string("readout") if "readout" in top else None,
         clearance=top.length("clearance", 1e-3), bodies=bodies,
         source=file.name, folder=folder,

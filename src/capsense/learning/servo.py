@@ -93,7 +93,7 @@ class PoseEstimator:
     its Jacobian (closed adjoint) gives the slopes by the pose; that by the radius is a difference.
 
     Args:
-        simulator: A sensor with gradients; ``preset="learning"`` will do.
+        simulator: A sensor with gradients; ``preset="fast"`` will do.
         belief: What is known beforehand.
         noise: Standard deviation of every measured capacitance [F].
         relative: A further part of it, proportional to the capacitance: gain, and what the limb is

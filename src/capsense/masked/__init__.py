@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import NoReturn
 
 import numpy as np
 import shapely
@@ -346,16 +347,13 @@ class MaskedScenes:
         """Forget the last solution."""
         self._solver.reset()
 
-    def potentials(self, points: Array) -> Array:
+    def field(self) -> NoReturn:
         """Not offered.
 
         Raises:
             ValueError: Always.
         """
-        raise ValueError('method "fem_masked" gives no potentials; use "surface"')
-
-    def charges(self) -> None:
-        """Not offered."""
+        raise ValueError('method "fem_masked" keeps no field; use "surface"')
 
     def solve_each(self, scenes: Sequence[Scene]) -> list[CapacitanceChange | CapSenseError]:
         """Return what each of many scenes changes, from rest, or what was wrong with it."""

@@ -32,7 +32,6 @@ from capsense._style import (
 )
 from capsense._validate import suggest
 from capsense.design.model import Design
-from capsense.errors import CapSenseError
 from capsense.plotting.designs import draw_design, draw_sensor, outline_patch
 from capsense.reading import Reading
 from capsense.scenario import Excitation
@@ -250,8 +249,9 @@ def plot(
         beside them the bodies' ways over the electrodes, from above and from the side.
 
     Raises:
-        CapSenseError: There is no reading, readings come without their simulator, times or
-            scenes are not as many, or an argument is of another kind.
+        TypeError: ``what`` is something else.
+        ValueError: There is no reading, readings come without their simulator, times or scenes are
+            not as many, or there is no such excitation.
     """
     from capsense.adapters import AttachedSensor
     from capsense.recording.export import run_of
@@ -266,26 +266,26 @@ def plot(
         run = run_of(what, list(what.steps()))
     else:
         if not isinstance(what, Sequence) or not all(isinstance(r, Reading) for r in what):
-            raise CapSenseError(
+            raise TypeError(
                 "plot takes a design, an open recording or a list of readings, not "
                 f"{type(what).__name__}; write plot(cs.load_design(name)) or plot(readings, sim)"
             )
         if isinstance(simulator, AttachedSensor):
             simulator = simulator.simulator
         if not isinstance(simulator, Simulator):
-            raise CapSenseError(
+            raise ValueError(
                 "readings are drawn with the simulator, or the sensor, that took them; give "
                 "plot(readings, sim)"
             )
         known = [e.value for e in Excitation]
         if excitation not in known:
-            raise CapSenseError(f"excitation is {excitation!r}; {suggest(excitation, known)}")
+            raise ValueError(f"excitation is {excitation!r}; {suggest(excitation, known)}")
         design, count = simulator.design, len(what)
         moments = np.arange(count) if times is None else np.asarray(times, dtype=float)
         seen = [Scene()] * count if scenes is None else scenes
         if moments.shape != (count,) or len(seen) != count:
             also = "" if scenes is None else f" and {len(seen)} scenes"
-            raise CapSenseError(
+            raise ValueError(
                 f"{count} readings, times of shape {moments.shape}{also}; give as many of each"
             )
         channels = channels_of(Excitation(excitation), design.electrode_names)
@@ -294,7 +294,7 @@ def plot(
             list(seen),
         )  # fmt: skip
     if not run.times:
-        raise CapSenseError("there is no reading to draw; take a step first")
+        raise ValueError("there is no reading to draw; take a step first")
     return plot_run(run, "number of the reading" if numbered else "time [s]")
 
 

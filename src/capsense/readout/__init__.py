@@ -306,6 +306,19 @@ class Readout:
                 "reset() to begin anew"
             )
 
+    def require_times(self, times: Sequence[float]) -> None:
+        """Refuse times [s] that :meth:`sample` could not be told one after another.
+
+        Raises:
+            ReadoutError: One is not finite, goes back, or leaps.
+        """
+        last = -math.inf if self._last is None else self._last[0] + self._start
+        for time in times:
+            self.require_forward(time, last)
+            last = time
+        if len(times):
+            self._require_patience(times[0] - self._start)
+
     def _require_patience(self, now: float) -> None:
         """Refuse a leap over more conversions than anybody wants at once."""
         plan = self.schedule

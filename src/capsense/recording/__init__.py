@@ -27,7 +27,7 @@ from capsense.readout import Readout
 from capsense.readout.config import file_content, parse_readout
 from capsense.scenario import FORMER_METHODS, METHODS, Channel, Excitation, Scenario
 from capsense.scenario.model import channels_of
-from capsense.simulator import Method, PresetName, Simulator
+from capsense.simulator import Method, PresetName, Simulator, checked_preset
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ class Session:
             "preset": self.preset, "frequency_Hz": self.excitation_frequency,
             "settings": asdict(self.settings), "electrodes": self.design.electrode_names,
             "empty_F": self.empty.capacitance.tolist(),
-            "empty_shield_coupling_F": shield_coupling(self.empty).tolist(),
+            "empty_shield_coupling_F": self.empty.shield_coupling.tolist(),
             "excitation": self.excitation, "pairs": self.pairs, "readout": self.readout,
             "versions": self.versions,
         }  # fmt: skip
@@ -221,7 +221,8 @@ def read_session(text: bytes, design: Design) -> Session:
         coupling = np.array(data["empty_shield_coupling_F"], dtype=float)
         empty = reading_of(design, capacitance, np.zeros_like(capacitance), coupling)
         return Session(
-            data["name"], data["title"], design, method, preset, data["frequency_Hz"],
+            data["name"], data["title"], design, method, checked_preset(preset),
+            data["frequency_Hz"],
             _read_settings(data["settings"]), empty, Excitation(data["excitation"]),
             tuple((a, b) for a, b in data["pairs"]), data["readout"], data["versions"],
         )  # fmt: skip
@@ -236,11 +237,6 @@ def _read_settings(data: Mapping[str, Any]) -> BuildSettings:
     mesh = data["mesh"] if "mesh" in data else data["lattice"]
     known = {f.name: float(mesh[f.name]) for f in fields(MeshSettings)}
     return BuildSettings(float(data["panel_scale"]), MeshSettings(**known))
-
-
-def shield_coupling(reading: Reading) -> Array:
-    """Maxwell coupling of each electrode to all shields [F], shape (M,)."""
-    return reading._shield_coupling
 
 
 def reading_of(

@@ -22,7 +22,6 @@ from capsense.recording import (
     Session,
     read_session,
     reading_of,
-    shield_coupling,
     versions,
 )
 from capsense.recording.ros import PACKAGE, decode, require
@@ -368,7 +367,7 @@ class _Comparison:
                     self._differs(index, time, name, a, b)
                     break
         was, now = (
-            np.concatenate([r.capacitance.ravel(), r.delta.ravel(), shield_coupling(r)])
+            np.concatenate([r.capacitance.ravel(), r.delta.ravel(), r.shield_coupling])
             for r in (recorded, replayed)
         )
         if np.array_equal(was, now):

@@ -51,6 +51,7 @@ class Recorder:
             ROS 2 nodes of this domain (``ROS_DOMAIN_ID``, 0 by default there).
 
     Raises:
+        TypeError: ``source`` is neither a simulator nor a sensor.
         RecordingError: The file is there already or cannot be made, or ``name`` is no name.
         ReadoutError: The readout is wrong, or there are two.
         MissingDependencyError: The optional packages are not installed.
@@ -74,7 +75,7 @@ class Recorder:
         self.count = 0
         """Steps recorded so far."""
         if not isinstance(source, Simulator | AttachedSensor):
-            raise RecordingError(
+            raise TypeError(
                 f"source is of {type(source).__name__}; give a Simulator, or a sensor that attach "
                 "returned"
             )
@@ -118,7 +119,12 @@ class Recorder:
         with self._one:
             self._check(time)
             scene = _scene(world)
-            return self._write(time, world, scene, self._simulator.step(scene, time=time))
+            return self._write(time, world, scene, self._stepped(scene, time))
+
+    def _stepped(self, scene: Scene, time: float) -> Reading:
+        if self._sensor is None:
+            return self._simulator.step(scene, time=time)
+        return self._simulator.solved(scene, time=time)  # its own chip is not the sensor's
 
     def read(self, time: float | None = None) -> Reading:
         """Read the attached sensor, record, and return the reading.

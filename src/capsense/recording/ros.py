@@ -19,7 +19,7 @@ from capsense._style import signal_colours, strength
 from capsense.codec import CHANGING, body_fields, shape_fields
 from capsense.errors import RecordingError, require_package
 from capsense.reading import Reading
-from capsense.recording import Session, shield_coupling
+from capsense.recording import Session
 from capsense.scenario.model import read_channels
 from capsense.scene import (
     Body,
@@ -262,7 +262,7 @@ class StepMessages:
             time=moment.time, bodies=np.array(ids, np.uint32),
             poses=[(b.pose.position, b.pose.quaternion) for b in scene],
             capacitance=reading.capacitance.ravel(), delta=reading.delta.ravel(),
-            shield_coupling=shield_coupling(reading), iterations=reading.stats.iterations,
+            shield_coupling=reading.shield_coupling, iterations=reading.stats.iterations,
             error_estimate=reading.stats.solver_error, wall_time=reading.stats.wall_time,
         )  # fmt: skip
         return out

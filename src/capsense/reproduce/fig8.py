@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 DESIGN = "six_patch_bare"
-PRESETS: tuple[PresetName, ...] = ("learning", "standard", "fine")
+PRESETS: tuple[PresetName, ...] = ("fast", "standard", "fine")
 REFINEMENTS = (0.43, 0.65, 0.8, 1.0)
 """Meshes of the paper's scheme, as multiples of the default's nodes along an axis."""
 REDUCED = (0.43, 0.65)

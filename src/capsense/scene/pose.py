@@ -129,6 +129,34 @@ class Pose(Frozen):
         return cls(position, _matrix_to_quaternion(r))
 
     @classmethod
+    def from_mujoco(cls, position: Sequence[float] | Array, orientation: ArrayLike) -> Pose:
+        """Make a pose from what MuJoCo tells, such as ``data.xpos[k], data.xquat[k]``.
+
+        Args:
+            position: Origin of the body's frame [m], shape (3,).
+            orientation: A quaternion in MuJoCo's order (w, x, y, z), shape (4,); or a rotation
+                matrix, row by row, shape (9,) or (3, 3), as ``data.xmat[k]``, ``data.site_xmat[k]``
+                and ``data.geom_xmat[k]`` are.
+
+        Raises:
+            SceneError: Wrong shape, a number that is not finite, a quaternion of zeros, or a matrix
+                that scales, shears or mirrors by more than 1e-6.
+        """
+        try:
+            given = np.asarray(orientation, dtype=float)
+        except (TypeError, ValueError):
+            given = np.empty(0)
+        if given.shape == (4,):
+            w, x, y, z = given.tolist()
+            return cls(position, (x, y, z, w))
+        if given.shape not in ((9,), (3, 3)):
+            raise SceneError(
+                f"orientation has shape {given.shape}; give a quaternion (w, x, y, z), "
+                "or a rotation matrix of shape (9,) or (3, 3)"
+            )
+        return cls(position, cls.from_matrix(given.reshape(3, 3)).quaternion)
+
+    @classmethod
     def from_euler(
         cls,
         position: Sequence[float] | Array,

@@ -75,8 +75,8 @@ class Preset:
 
 
 PRESETS = {
+    "fast": Preset(panels=300, threshold=0.05, coarsest=0.95, finest=None),
     "standard": Preset(),
-    "learning": Preset(panels=300, threshold=0.05, coarsest=0.95, finest=None),
     "fine": Preset(panels=1000, threshold=0.004, coarsest=0.44, finest=3e-3),
 }
 """Presets by name."""
@@ -105,6 +105,47 @@ def _turned(axis: int, angle: float) -> Array:
     out[j, i] = math.sin(angle)
     out[i, j] = -out[j, i]
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedField:
+    """Potentials and charges of a scene that was solved."""
+
+    function: GreenFunction
+    """Of the design."""
+    length: float
+    """Length that kernels take for one [m]."""
+    terminals: int
+    """How many there are."""
+    last: tuple[View, Solution] | None
+    """The scene and its solution; None where no body was near."""
+
+    def potentials(self, points: Array) -> Array:
+        """Potentials at points [V], shape (n, 3) -> (n, terminals)."""
+        out = np.clip(self.function.phi0(points), 0.0, 1.0)
+        if self.last is None:
+            return out
+        view, solution = self.last
+        function = replace(self.function, unit=1.0)
+        out += potential_change(function, solution, points / self.length)
+        for place in np.flatnonzero(view.matter.conducting).tolist():
+            body = view.scene[int(view.met[place])]
+            if body.shape.kind in (ShapeKind.MESH, ShapeKind.LAYERS):
+                continue
+            inside = body.shape.signed_distance(body.pose.inverse().apply(points)) < 0
+            if inside.any():
+                out[inside] = 0.0 if body.grounding == "grounded" else out[inside].mean(axis=0)
+        return out
+
+    def charges(self) -> Charges | None:
+        """Charges on the bodies; None where there are none."""
+        if self.last is None:
+            return None
+        _, solution = self.last
+        area = np.maximum(solution.extent, 1e-9)[:, None] ** 2
+        density = UNIT / self.length * np.abs(solution.charge[:, : self.terminals]) / area
+        points, pitch = solution.points.mean(axis=1), float(np.median(solution.extent))
+        return Charges(self.length * points, density, self.length * pitch)
 
 
 class SurfaceSolver:
@@ -269,32 +310,9 @@ class SurfaceSolver:
             if k in near
         )
 
-    def potentials(self, points: Array) -> Array:
-        """Potentials of the last scene at points [V], shape (n, 3) -> (n, terminals)."""
-        out = np.clip(self._function.phi0(points), 0.0, 1.0)
-        if self._last is None:
-            return out
-        view, solution = self._last
-        function = replace(self._function, unit=1.0)
-        out += potential_change(function, solution, points / self.length)
-        for place in np.flatnonzero(view.matter.conducting).tolist():
-            body = view.scene[int(view.met[place])]
-            if body.shape.kind in (ShapeKind.MESH, ShapeKind.LAYERS):
-                continue
-            inside = body.shape.signed_distance(body.pose.inverse().apply(points)) < 0
-            if inside.any():
-                out[inside] = 0.0 if body.grounding == "grounded" else out[inside].mean(axis=0)
-        return out
-
-    def charges(self) -> Charges | None:
-        """Charges on the bodies of the last scene; None where there are none."""
-        if self._last is None:
-            return None
-        _, solution = self._last
-        area = np.maximum(solution.extent, 1e-9)[:, None] ** 2
-        density = UNIT / self.length * np.abs(solution.charge[:, : self.green.terminals]) / area
-        points, pitch = solution.points.mean(axis=1), float(np.median(solution.extent))
-        return Charges(self.length * points, density, self.length * pitch)
+    def field(self) -> SolvedField:
+        """What the last scene did to the field; it stays when other scenes are solved."""
+        return SolvedField(self._function, self.length, self.green.terminals, self._last)
 
     def reset(self) -> None:
         """Forget the last scene, and what covers remember of their contacts."""

@@ -45,7 +45,7 @@ class Show:
 
     def __init__(self, sensor: AttachedSensor, *, host: str, port: int) -> None:
         if not isinstance(sensor, AttachedSensor):
-            raise SceneError(
+            raise TypeError(
                 f"sensor is of {type(sensor).__name__}; give a sensor that attach returned, or "
                 "watch a scenario or a recording with capsense view"
             )
@@ -132,6 +132,7 @@ def show(sensor: AttachedSensor, *, host: str = "127.0.0.1", port: int = 8080) -
         port: Its port; 0 for any free one.
 
     Raises:
+        TypeError: ``sensor`` is not one that ``attach`` returned.
         ServerError: The address or port cannot be had.
         MissingDependencyError: The optional packages are not installed.
     """

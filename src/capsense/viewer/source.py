@@ -79,8 +79,11 @@ class Source:
         Raises:
             CapSenseError: They could not be had.
         """
-        self._simulator.step(frame.scene)
-        return self._simulator.potentials(plane.points)
+        return self._solved(frame.scene).potentials(plane.points)
+
+    def _solved(self, scene: Scene) -> Reading:
+        """A reading that keeps its field."""
+        return self._simulator.solved(scene, keep_field=True)
 
     def close(self) -> None:
         """Let go of what is held."""
@@ -134,11 +137,11 @@ class ScenarioSource(Seekable):
     def frame(self, index: int, plane: Plane | None = None) -> Frame:
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
-        reading = self._simulator.step(scene, time=time)
+        reading = self._simulator.step(scene, time=time, keep_field=plane is not None)
         if plane is None:
             return Frame(index, time, scene, reading)
-        found = self._simulator.potentials(plane.points)
-        return Frame(index, time, scene, reading, plane, found, self._simulator.charges())
+        found, charges = reading.potentials(plane.points), reading.charges()
+        return Frame(index, time, scene, reading, plane, found, charges)
 
 
 class RecordingSource(Seekable):
@@ -173,8 +176,9 @@ class RecordingSource(Seekable):
         frame = Frame(index, float(self.times[index]), step.scene, step.reading)
         if plane is None:
             return frame
-        found = self.potentials(frame, plane)
-        return replace(frame, plane=plane, potentials=found, charges=self._simulator.charges())
+        kept = self._solved(step.scene)
+        found, charges = kept.potentials(plane.points), kept.charges()
+        return replace(frame, plane=plane, potentials=found, charges=charges)
 
 
 Address = tuple[int, int]

@@ -197,7 +197,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         self,
         randomisation: Randomisation | Mapping[str, Sequence[float]] | None = None,
         chip: str = "fdc1004",
-        preset: PresetName = "learning",
+        preset: PresetName = "fast",
         design: AnyDesign | None = None,
     ) -> None:
         self.randomisation = Randomisation.of(randomisation)

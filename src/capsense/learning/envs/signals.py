@@ -23,6 +23,7 @@ from capsense.reading import Reading
 from capsense.readout import SEED_STRIDE, Readout
 from capsense.readout.config import make_readout
 from capsense.scene import Pose
+from capsense.simulator import DEFAULT_DESIGN
 from capsense.skin import AnyDesign
 
 KEY = "capacitive"
@@ -121,7 +122,8 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         options: As for ``attach_skin``: ``materials``, ``grounding``, ``exclude`` and so on.
 
     Raises:
-        SceneError: It is no MuJoCo environment, or has no such site.
+        TypeError: It is no MuJoCo environment.
+        SceneError: It has no such site.
         DesignError: The design is wrong.
         ReadoutError: There is no such chip or file.
     """
@@ -130,7 +132,7 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         self,
         env: gymnasium.Env[Any, Any],
         sites: Sequence[str],
-        design: AnyDesign = "six_patch",
+        design: AnyDesign = DEFAULT_DESIGN,
         readout: str | Path = "fdc1004",
         **options: Any,
     ) -> None:
@@ -140,7 +142,7 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         self._how = how
         inner = env.unwrapped
         if not hasattr(inner, "model") or not hasattr(inner, "data"):
-            raise SceneError(
+            raise TypeError(
                 f"env is a {type(inner).__name__}, which has no MuJoCo model and data; give a "
                 "MuJoCo environment"
             )

@@ -141,7 +141,8 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         options: Those of a single environment.
 
     Raises:
-        SceneError: ``num_envs`` is not a whole number from 1, or an option is wrong.
+        ValueError: ``num_envs`` is not a whole number from 1.
+        SceneError: An option is wrong.
         ReadoutError: There is no such chip.
         DesignError: The design is wrong.
     """
@@ -157,7 +158,7 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         **options: Any,
     ) -> None:
         if (as_whole(num_envs) or 0) < 1:
-            raise SceneError(f"num_envs is {num_envs!r}; give a whole number from 1")
+            raise ValueError(f"num_envs is {num_envs!r}; give a whole number from 1")
         num_envs = int(num_envs)
         first = self.world(**options)
         shared = {**options, "design": first.simulator}
