@@ -453,7 +453,8 @@ class Fleet:
         """Which sensors of some environments lack the first millimetres, see :class:`FleetCheck`.
 
         Args:
-            poses, sensors: As :meth:`step` takes them, on the host.
+            poses: As :meth:`step` takes them, on the host.
+            sensors: As ``poses``.
             rows: Numbers of the environments, shape (k,).
 
         Returns:
