@@ -358,7 +358,7 @@ def test_wrapper_on_other_models(tmp_path: Path, name: str, body: str) -> None:
 
 
 def test_wrapper_refuses_what_has_no_model() -> None:
-    with pytest.raises(cs.SceneError, match="no MuJoCo model"):
+    with pytest.raises(TypeError, match="no MuJoCo model"):
         CapacitiveObservation(gymnasium.make("CartPole-v1"), ["pad"])
     with pytest.raises(cs.SceneError, match="no model file"):
         write_model("CartPole-v1", "cart", TIP, "cart.xml")
