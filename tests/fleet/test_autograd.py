@@ -95,7 +95,7 @@ def test_arguments_of_the_other_function():
     given = torch.tensor(poses, requires_grad=True)
     with pytest.raises(SceneError, match=r"poses is a tensor .*autograd\.change\(fleet, poses\)"):
         fleet.step(given)
-    with pytest.raises(SceneError, match=r"poses is of ndarray; give a tensor"):
+    with pytest.raises(TypeError, match=r"poses is of ndarray; give a tensor"):
         change(fleet, poses)
     with pytest.raises(TypeError, match=r"sensors is of ndarray; give a tensor"):
         change(fleet, given, poses)
