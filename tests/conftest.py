@@ -93,14 +93,14 @@ def foam_field(
 
 
 LAYERS = {
-    "unit": "design elements humans mesh plotting readout scene surface field/test_panels.py "
+    "unit": "design humans mesh plotting readout scene solver field/test_panels.py "
     "field/test_grid.py test_constants_page.py test_jit.py test_public_api.py test_reading.py "
     "test_scenario.py test_shared.py test_simd.py test_thread_pool.py",
     "physics": "",  # all that is not named
     "e2e": "adapters benchmarks cli learning recording reproduce server unity viewer "
     "field/test_cache.py field/test_shipped.py fleet/test_autograd.py "
     "fleet/test_genesis.py fleet/test_isaac_lab.py fleet/test_mjlab.py "
-    "fleet/test_parallel_simulators.py mesh/test_gmsh_mesher.py surface/test_soft_gap.py "
+    "fleet/test_parallel_simulators.py mesh/test_gmsh_mesher.py solver/test_soft_gap.py "
     "test_assistive_gym_patch.py "
     "test_contributing.py test_copies.py test_damaged.py test_examples.py test_from_the_paper.py "
     "test_project.py "
