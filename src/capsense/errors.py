@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
@@ -19,6 +20,30 @@ class CapSenseError(Exception):
     def __str__(self) -> str:
         text = super().__str__()
         return text if len(text) <= _LONGEST else f"{text[:_HEAD]} […] {text[-_TAIL:]}"
+
+
+class ExperimentalWarning(UserWarning):
+    """A part is used that was never run with the program or device that it is for."""
+
+
+_warned: set[str] = set()
+
+
+def warn_experimental(part: str, tested: str) -> None:
+    """Warn once in a process that a part is experimental.
+
+    Args:
+        part: What it is called.
+        tested: What it was tested with in place of the program that it is for.
+    """
+    if part not in _warned:
+        _warned.add(part)
+        warnings.warn(
+            f"{part} is experimental: it was tested with {tested} only; compare its readings with "
+            "a scene that you know, and see the page on support levels",
+            ExperimentalWarning,
+            stacklevel=3,
+        )
 
 
 class DesignError(CapSenseError, ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
+from capsense import errors
 from capsense.errors import ReadoutError
 
 pytest.importorskip(
@@ -372,3 +374,19 @@ def test_a_simulator_that_makes_no_scripts(tiny_simulator: cs.Simulator) -> None
     assert not sensor.read().delta.any()
     assert "sim.callScriptFunction" not in server.calls
     server.close()
+
+
+def test_the_adapter_says_once_that_it_is_experimental(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the first use in a process."""
+    monkeypatch.setattr(errors, "_warned", set())
+    put(server, "block")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator, resolution=100)
+    said = [w for w in caught if issubclass(w.category, cs.ExperimentalWarning)]
+    assert len(said) == 1
+    assert "stand-in" in str(said[0].message)
+    assert said[0].filename == __file__

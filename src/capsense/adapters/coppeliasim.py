@@ -35,7 +35,7 @@ from capsense.adapters.rules import (
     split_rules,
 )
 from capsense.design.model import Design
-from capsense.errors import AdapterError, SceneError
+from capsense.errors import AdapterError, SceneError, warn_experimental
 from capsense.readout import Readout
 from capsense.readout.config import make_readout
 from capsense.scene import Material, Pose
@@ -154,6 +154,7 @@ def attach(
         DesignError: The design is wrong.
         ReadoutError: There is no such chip.
     """
+    warn_experimental("the adapter of CoppeliaSim", "a stand-in with the same wire format")
     pose = Pose() if pose_in_object is None else checked_pose(pose_in_object, "pose_in_object")
     remote = Remote(sim)
     handle = remote.find(object)

@@ -14,7 +14,7 @@ from isaaclab.utils import configclass
 from isaaclab_newton.physics import NewtonManager
 
 from capsense.adapters.newton import SensorCapacitance
-from capsense.errors import SceneError
+from capsense.errors import SceneError, warn_experimental
 from capsense.simulator import DEFAULT_DESIGN
 
 
@@ -44,6 +44,7 @@ class CapacitiveSensor(SensorBase):
 
     def __init__(self, cfg: CapacitiveSensorCfg) -> None:
         super().__init__(cfg)
+        warn_experimental("the sensor of Isaac Lab", "a stand-in and a real model of Newton")
         self._labels = [
             NewtonManager.register_site(cfg.prim_path, wp.transform(position, turn))
             for position, turn in cfg.offsets
