@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -221,3 +222,22 @@ def test_a_readout_file(sim: cs.Simulator, path: Path, tmp_path: Path) -> None:
     assert f"conversions  {found.counts}\n" in str(found)
     steps = list(cs.open_recording(path).steps())
     assert any(s.reading.counts is not None and s.reading.counts.touched is not None for s in steps)
+
+
+def test_without_mcap_the_extra_is_named() -> None:
+    """Regression: the import of ``mcap`` failed, without a fix."""
+    code = (
+        "import sys\n"
+        "class Missing:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] == 'mcap':\n"
+        "            raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, Missing())\n"
+        "import capsense as cs\n"
+        "try:\n"
+        "    cs.record\n"
+        "except cs.MissingDependencyError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "pip install 'capsense[record]'" in done.stdout, done.stderr

@@ -12,13 +12,21 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
-
-from capsense.errors import RecordingError
+from capsense.errors import RecordingError, require_package
 from capsense.recording import ros
+
+require_package("mcap", "mcap, which recordings need,", "record")
+from mcap.data_stream import ReadDataStream  # noqa: E402
+from mcap.opcode import Opcode  # noqa: E402
+from mcap.records import (  # noqa: E402
+    Attachment,
+    Channel,
+    Chunk,
+    Message,
+    Metadata,
+    Schema,
+)
+from mcap.stream_reader import get_chunk_data_stream  # noqa: E402
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
