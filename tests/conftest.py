@@ -22,9 +22,6 @@ from capsense.field.cache import load_or_build
 if interpreted.ON:
     interpreted.start()
 
-pytest.approx(0.0).__class__.DEFAULT_ABSOLUTE_TOLERANCE = 0.0
-"""pytest's own, 1e-12, lets any capacitance pass for any other: they are of some 1e-15 F."""
-
 Simulators = Callable[..., "cs.Simulator"]
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.cover import Cover, StressStrain
@@ -24,7 +25,7 @@ def cover(law: StressStrain) -> Foundation:
 
 def test_flat_punch_is_a_linear_spring():
     depth = depth_of_force(np.zeros(50), 2e-6, 1.5, cover(StressStrain.linear(E)))
-    assert depth == pytest.approx(1.5 * T / (E * 1e-4), rel=1e-12)
+    assert depth == approx(1.5 * T / (E * 1e-4), rel=1e-12)
 
 
 def test_sphere_force_is_pi_modulus_radius_depth_squared_over_thickness():
@@ -33,8 +34,8 @@ def test_sphere_force_is_pi_modulus_radius_depth_squared_over_thickness():
     area = np.pi * 6e-3**2 / count
     height = area * (np.arange(count) + 0.5) / (2.0 * np.pi * radius)
     force = contact_force(height, area, depth, soft)
-    assert force == pytest.approx(np.pi * E * radius * depth**2 / T, rel=1e-6)
-    assert depth_of_force(height, area, force, soft) == pytest.approx(depth)
+    assert force == approx(np.pi * E * radius * depth**2 / T, rel=1e-6)
+    assert depth_of_force(height, area, force, soft) == approx(depth)
 
 
 def test_forces_are_those_of_the_table():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.scenario import play
@@ -24,8 +25,8 @@ def test_five_lines(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(gains) == ["E1", "E2", "E3", "E4", "E5", "E6"]
     assert min(gains.values()) > 10
     corners = [gains[k] for k in ("E1", "E3", "E4", "E6")]
-    assert corners == pytest.approx([corners[0]] * 4, abs=0.2)
-    assert gains["E2"] == pytest.approx(gains["E5"], abs=0.2)
+    assert corners == approx([corners[0]] * 4, abs=0.2)
+    assert gains["E2"] == approx(gains["E5"], abs=0.2)
 
 
 def test_hand_approach() -> None:
@@ -65,7 +66,7 @@ def test_steel_bar_triangle() -> None:
         assert deepest(apex - 0.15, apex + 0.15) < deepest(start, end)
     assert min(v for t, v in loss if abs(t - line_ends) < 0.2) < 0.002
     again = trajectory.duration
-    assert deepest(again, again + line_ends) == pytest.approx(deepest(0.0, line_ends), rel=0.02)
+    assert deepest(again, again + line_ends) == approx(deepest(0.0, line_ends), rel=0.02)
 
 
 def test_touch_approach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 import capsense as cs
 from capsense.constants import EPS0
@@ -36,8 +37,8 @@ def mutual(sim: cs.Simulator, level: float, gap: float, material: cs.Material | 
 def test_tank_by_gap(tank: cs.Simulator, gap: float) -> None:
     """Reference: finite volumes."""
     water, steel = TANK[gap]
-    assert mutual(tank, 0.33, gap, WATER) == pytest.approx(water, rel=0.2)
-    assert mutual(tank, 0.33, gap, "steel") == pytest.approx(steel, rel=0.12)
+    assert mutual(tank, 0.33, gap, WATER) == approx(water, rel=0.2)
+    assert mutual(tank, 0.33, gap, "steel") == approx(steel, rel=0.12)
 
 
 @pytest.mark.e2e
@@ -48,7 +49,7 @@ def test_tank_by_level(tank: cs.Simulator, material: cs.Material | str) -> None:
     levels = np.array([0.11, 0.22, 0.33])
     rise = np.array([mutual(tank, level, 0.0, material) for level in levels]) - empty
     np.testing.assert_allclose(rise / levels, rise[-1] / levels[-1], rtol=0.15)
-    assert empty == pytest.approx(5.7, rel=0.02)
+    assert empty == approx(5.7, rel=0.02)
 
 
 def two_balls(a: float, b: float, d: float) -> np.ndarray:
@@ -102,7 +103,7 @@ def test_thin_cylinder_over_a_pad_on_a_board(field_cache: Path) -> None:
     sim = cs.Simulator(design, cache_dir=field_cache)
     for gap, wanted in ROUND.items():
         body = cs.Body(cs.Cylinder(0.05, 0.001), cs.Pose((0, 0, gap + 5e-4)), "steel")
-        assert 1e15 * sim.step(cs.Scene([body])).delta[0, 0] == pytest.approx(wanted, rel=0.06)
+        assert 1e15 * sim.step(cs.Scene([body])).delta[0, 0] == approx(wanted, rel=0.06)
 
 
 @pytest.mark.e2e
@@ -115,7 +116,7 @@ def test_a_thin_plate_over_a_plate(field_cache: Path) -> None:
     })  # fmt: skip
     sim = cs.Simulator(design, cache_dir=field_cache)
     plate = cs.Body(cs.Box((*side, 1e-4)), cs.Pose((0, 0, 0.02 + 5e-5)), "steel")
-    assert 1e12 * sim.step(cs.Scene([plate])).capacitance[0, 0] == pytest.approx(8.107, rel=0.03)
+    assert 1e12 * sim.step(cs.Scene([plate])).capacitance[0, 0] == approx(8.107, rel=0.03)
 
 
 @pytest.mark.parametrize("design", ["gripper_pad", "patch"])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import build_parser
@@ -84,15 +85,15 @@ def test_conventions_of_an_asymmetric_pose() -> None:
         for line in code.splitlines()
         if "print(" in line
     ]
-    assert printed[0] == pytest.approx(pose.quaternion, abs=5e-5)
-    assert printed[1] == pytest.approx(pose.apply((1.0, 0.0, 0.0)), abs=5e-5)
+    assert printed[0] == approx(pose.quaternion, abs=5e-5)
+    assert printed[1] == approx(pose.apply((1.0, 0.0, 0.0)), abs=5e-5)
     roll, pitch, yaw = np.radians((10, 20, 30))
     c, s = np.cos, np.sin
     rx = np.array([[1, 0, 0], [0, c(roll), -s(roll)], [0, s(roll), c(roll)]])
     ry = np.array([[c(pitch), 0, s(pitch)], [0, 1, 0], [-s(pitch), 0, c(pitch)]])
     rz = np.array([[c(yaw), -s(yaw), 0], [s(yaw), c(yaw), 0], [0, 0, 1]])
-    assert pose.rotation == pytest.approx(rz @ ry @ rx, abs=1e-12)
-    assert pose.apply((0, 0, 0)) == pytest.approx((0.1, 0.2, 0.3))
+    assert pose.rotation == approx(rz @ ry @ rx, abs=1e-12)
+    assert pose.apply((0, 0, 0)) == approx((0.1, 0.2, 0.3))
 
 
 def test_the_reference_names_what_is_there() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from tiny_field import few_sources
 
 import capsense as cs
@@ -94,7 +95,7 @@ def test_scaled_scenes_have_the_same_readings(scale: float):
         was, now = one.step(cs.Scene(before)), other.step(cs.Scene(after))
         assert np.abs(was.delta).max() > 0, name
         _close(now.delta / scale, was.delta)
-        assert now.stats.solver_error / scale == pytest.approx(was.stats.solver_error, rel=1e-3)
+        assert now.stats.solver_error / scale == approx(was.stats.solver_error, rel=1e-3)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
@@ -111,7 +112,7 @@ def test_slopes_and_potentials_scale(scale: float):
         _close(now[..., 3:] / scale, was[..., 3:])
         _close(readings[1].potentials(scale * points), readings[0].potentials(points))
         held = [reading.charges() for reading in readings]
-        assert held[1].pitch == pytest.approx(scale * held[0].pitch)
+        assert held[1].pitch == approx(scale * held[0].pitch)
         _close(held[1].points / scale, held[0].points)
         _close(held[1].density * scale, held[0].density)
 
@@ -164,9 +165,9 @@ def test_a_ball_over_a_disc_in_the_open_reads_what_exact_images_say():
     for radius in (5e-3, 5e-6):
         sim = _disc(radius, 100 * radius, 50 * radius, True)
         own = 8 * EPS0 * radius
-        assert sim.baseline[0, 0] == pytest.approx(own, rel=2e-3)
+        assert sim.baseline[0, 0] == approx(own, rel=2e-3)
         for z, expected in ((3 * radius, 0.0786), (2 * radius, 0.2009)):
-            assert sim.step(_ball(radius, z)).delta[0, 0] / own == pytest.approx(expected, rel=0.02)
+            assert sim.step(_ball(radius, z)).delta[0, 0] / own == approx(expected, rel=0.02)
 
 
 @pytest.mark.e2e
@@ -174,8 +175,8 @@ def test_small_boxes_are_like_large_ones():
     # boundary elements of disc, walls and ball, by PlaneResponse with 320 triangles for a plane
     for size, expected in ((0.3, 52.2), (0.05, 50.4), (0.04, 48.9), (0.03, 45.2)):
         reading = _disc(5e-3, size, 5e-3, False).step(_ball(4e-3, 8e-3))
-        assert reading.delta[0, 0] == pytest.approx(1e-15 * expected, rel=0.02)
+        assert reading.delta[0, 0] == approx(1e-15 * expected, rel=0.02)
     small, large = (_disc(5e-3, size, 0.5 * size, True) for size in (0.03, 0.3))
     for z, within in ((0.01, 5e-3), (0.015, 5e-3), (0.03, 0.05)):  # the last far outside the box
         one, other = (sim.step(_ball(5e-3, z)).delta[0, 0] for sim in (small, large))
-        assert one == pytest.approx(other, rel=within)
+        assert one == approx(other, rel=within)

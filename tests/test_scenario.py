@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from changed_data import DROP, changed_copy
 from hypothesis import given
 from hypothesis import strategies as st
@@ -62,18 +63,18 @@ def test_base() -> None:
     """Everything of a plain file arrives where it should."""
     scenario = parse_scenario(BASE)
     assert (scenario.name, scenario.design.name) == ("base", "six_patch")
-    assert scenario.duration == pytest.approx(3.0)
-    assert scenario.times == pytest.approx(np.arange(31) / 10)
+    assert scenario.duration == approx(3.0)
+    assert scenario.times == approx(np.arange(31) / 10)
     assert [c.column_name for c in scenario.channels] == ["Cm_E1_E2", "Cm_E3_E1"]
     assert scenario.method == "surface"
     assert parse_scenario({**BASE, "method": "fem_masked"}).method == "fem_masked"
     assert parse_scenario({**BASE, "method": "masked"}).method == "fem_masked"  # its former name
     scene = scenario.scene_at(1.0)
-    assert scene["bar"].pose.position == pytest.approx((0.0, 0.0, 0.05))
+    assert scene["bar"].pose.position == approx((0.0, 0.0, 0.05))
     assert scene["bar"].grounding == "grounded"
     assert scene["ball"].pose.position == (0.0, 0.05, 0.1)
     assert scene["ball"].grounding == "floating"
-    assert scenario.scene_at(99.0)["bar"].pose.position == pytest.approx((0.1, 0.0, 0.15))
+    assert scenario.scene_at(99.0)["bar"].pose.position == approx((0.1, 0.0, 0.15))
 
 
 def test_bodies_share_their_shapes() -> None:
@@ -112,8 +113,8 @@ def test_mesh_body(tmp_path: Path, suffix: str) -> None:
     }
     scenario = parse_scenario(changed(("body", [body])), folder=tmp_path)
     shape = scenario.bodies[0].body.shape
-    assert np.ptp(shape.bounds(), axis=0) == pytest.approx((0.02, 0.03, 0.04))
-    assert shape.volume == pytest.approx(24e-6)
+    assert np.ptp(shape.bounds(), axis=0) == approx((0.02, 0.03, 0.04))
+    assert shape.volume == approx(24e-6)
 
 
 def test_material_and_grounding() -> None:
@@ -135,11 +136,11 @@ def test_design_beside_the_scenario(tmp_path: Path) -> None:
 
 def test_times() -> None:
     """Samples from 0 to the duration, both included; a still scene is one sample."""
-    assert parse_scenario(changed(("duration", 0.35))).times == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert parse_scenario(changed(("duration", 0.35))).times == approx([0, 0.1, 0.2, 0.3])
     assert parse_scenario(changed(("duration", 0.3))).count == 4  # 0.3 * 10 is not quite 3
     assert parse_scenario(changed(("body.0", BASE["body"][1]), ("body.1.name", "b"))).count == 1
     fast = parse_scenario(BASE).resampled(100.0)
-    assert (fast.count, fast.duration) == (301, pytest.approx(3.0))
+    assert (fast.count, fast.duration) == (301, approx(3.0))
 
 
 def test_path() -> None:
@@ -192,7 +193,7 @@ def test_speeds_and_dwell() -> None:
     way = Trajectory(
         poses((0, 0, 0), (1, 0, 0), (1, 2, 0)), speeds=(1.0, 4.0), dwell=(0.5, 1.0, 2.0)
     )
-    assert way.duration == pytest.approx(0.5 + 1 + 1 + 0.5 + 2)
+    assert way.duration == approx(0.5 + 1 + 1 + 0.5 + 2)
     expected = {
         -1.0: (0, 0, 0),
         0.3: (0, 0, 0),
@@ -204,17 +205,17 @@ def test_speeds_and_dwell() -> None:
         99.0: (1, 2, 0),
     }
     for time, point in expected.items():
-        assert way.pose_at(time).position == pytest.approx(point), time
+        assert way.pose_at(time).position == approx(point), time
 
 
 def test_closed_way_repeats() -> None:
     """A closed trajectory is periodic, rests included."""
     way = Trajectory(poses((0, 0, 0), (1, 0, 0), (0, 1, 0)), (1.0,) * 3, (0.5, 0, 0), closed=True)
-    assert way.duration == pytest.approx(2.5 + math.sqrt(2))
+    assert way.duration == approx(2.5 + math.sqrt(2))
     for time in np.linspace(0, way.duration, 40):
         once, again = way.pose_at(time), way.pose_at(time + 3 * way.duration)
-        assert again.position == pytest.approx(once.position, abs=1e-12)
-    assert way.pose_at(way.duration + 0.4).position == pytest.approx((0, 0, 0), abs=1e-12)
+        assert again.position == approx(once.position, abs=1e-12)
+    assert way.pose_at(way.duration + 0.4).position == approx((0, 0, 0), abs=1e-12)
 
 
 @given(st.floats(0, 30), st.floats(1e-6, 1e-2))
@@ -239,7 +240,7 @@ def test_turning() -> None:
     way = Trajectory(tuple(turn), (1.0,))
     for share, angle in ((0.0, 170), (0.25, 175), (0.5, 180), (1.0, 190)):
         expected = Pose.from_euler((share, 0, 0), (0, 0, angle), degrees=True)
-        assert way.pose_at(share).rotation == pytest.approx(expected.rotation, abs=1e-12)
+        assert way.pose_at(share).rotation == approx(expected.rotation, abs=1e-12)
 
 
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1)
@@ -250,13 +251,13 @@ def test_slerp(start: tuple[float, ...], end: tuple[float, ...], share: float) -
     """Unit length, ends met, and the same from either end."""
     a, b = Pose((0, 0, 0), start).quaternion, Pose((0, 0, 0), end).quaternion
     q = slerp(a, b, share)
-    assert math.hypot(*q) == pytest.approx(1, abs=1e-9)
-    assert slerp(a, b, 0.0) == pytest.approx(a, abs=1e-9)
+    assert math.hypot(*q) == approx(1, abs=1e-9)
+    assert slerp(a, b, 0.0) == approx(a, abs=1e-9)
     overlap = abs(sum(x * y for x, y in zip(slerp(a, b, 1.0), b, strict=True)))
-    assert overlap == pytest.approx(1, abs=1e-9)
+    assert overlap == approx(1, abs=1e-9)
     if abs(sum(x * y for x, y in zip(a, b, strict=True))) > 1e-6:
         back = slerp(b, a, 1 - share)
-        assert abs(sum(x * y for x, y in zip(q, back, strict=True))) == pytest.approx(1, abs=1e-9)
+        assert abs(sum(x * y for x, y in zip(q, back, strict=True))) == approx(1, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from random_scenes import random_scene
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
 from capsense.errors import BatchError, SolveError
-from capsense.field.background import Change
+from capsense.field.background import CapacitanceChange
 from capsense.masked import MaskedScenes
 from capsense.solver import surface_solver as solver
 from capsense.solver.surface_solver import SurfaceSolver, View
@@ -51,7 +52,7 @@ def test_each_reading_is_that_of_a_step_from_rest(tiny: cs.Simulator, threads: i
             np.testing.assert_array_equal(a.delta, b.delta)
             np.testing.assert_array_equal(a.self_capacitance, b.self_capacitance)
             assert a.stats.unknowns == b.stats.unknowns
-            assert a.stats.solver_error == pytest.approx(b.stats.solver_error, rel=1e-12)
+            assert a.stats.solver_error == approx(b.stats.solver_error, rel=1e-12)
         views, expected = views[::-1], expected[::-1]
 
 
@@ -149,7 +150,7 @@ def test_the_scheme_of_the_paper(field_cache: Path, monkeypatch: pytest.MonkeyPa
         np.testing.assert_array_equal(reading.delta, delta)
     solve = MaskedScenes.solve
 
-    def fail(self: MaskedScenes, scene: cs.Scene) -> Change:
+    def fail(self: MaskedScenes, scene: cs.Scene) -> CapacitanceChange:
         if scene is views[1]:
             raise SolveError("no convergence")
         return solve(self, scene)

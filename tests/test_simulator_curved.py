@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from curved_cases import RADIUS, curved_body, curved_figures, curved_reference
 from field_cases import assert_physical
 
@@ -128,7 +129,7 @@ def test_near_contact(simulators, radius, gap):
     sim = simulators("arm_segment")
     sim.reset()
     delta = 1e15 * sim.step(_ball(1e-3 * radius, 1e-3 * gap)).delta[1, 1]
-    assert delta == pytest.approx(NEAR[radius, gap], rel=0.03)
+    assert delta == approx(NEAR[radius, gap], rel=0.03)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

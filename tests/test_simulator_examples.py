@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from approximate import approx
 
 ROOT = Path(__file__).parents[1]
 
@@ -43,7 +44,7 @@ def test_forearm(
     table = (tmp_path / "forearm.csv").read_text(encoding="utf-8").splitlines()
     assert len(table) == 1 + len(record.time)
     last = [float(v) for v in table[-1].split(",")]
-    assert last[2] == pytest.approx(record.delta[-1][0, 0] * 1e15, abs=1e-4)
+    assert last[2] == approx(record.delta[-1][0, 0] * 1e15, abs=1e-4)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split()[2:8] == list(record.names)
     assert len(lines) == 1 + -(-len(record.time) // 10)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from sheet_theory import first_order
 
 import capsense as cs
@@ -49,9 +50,9 @@ def test_twice_the_sheet_does_twice_as_much(simulators):
     sim = simulators("six_patch")
     for z in (0.012, 0.02, 0.03):
         thin, thick = (sim.step(cs.Scene([sheet(z, t)])).delta[1, 1] for t in (2.5e-4, 5e-4))
-        assert thick == pytest.approx(2 * thin, rel=0.05)
+        assert thick == approx(2 * thin, rel=0.05)
         light, dense = (sim.step(cs.Scene([sheet(z, 5e-4, e)])).delta[1, 1] for e in (1.01, 1.02))
-        assert dense == pytest.approx(2 * light, rel=0.05)
+        assert dense == approx(2 * light, rel=0.05)
 
 
 @pytest.mark.parametrize(("eps_r", "sigma"), [(3.0, 2.8e-5), (10.0, 4.2e-4)])
@@ -76,5 +77,5 @@ def test_losses_of_what_deforms(simulators, eps_r, sigma):
             vertices, faces, thickness=0.002, material=matter, grounding="floating"
         )
         wanted, found = (sim.step(cs.Scene([b])) for b in (rigid, surface.body()))
-        assert found.delta[1, 1] == pytest.approx(wanted.delta[1, 1], rel=0.16)
-        assert found.conductance[1, 1] == pytest.approx(wanted.conductance[1, 1], rel=0.25)
+        assert found.delta[1, 1] == approx(wanted.delta[1, 1], rel=0.16)
+        assert found.conductance[1, 1] == approx(wanted.conductance[1, 1], rel=0.25)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from approximate import approx
 from field_cases import (
     assert_physical,
     ball,
@@ -368,7 +369,7 @@ def test_jacobian_of_a_long_body_is_about_its_own_origin(sim):
 
     slope, step = read(0.0).jacobian[0, 1, 1, 4], 2e-4
     difference = (read(step).delta - read(-step).delta)[1, 1] / (2 * step)
-    assert slope == pytest.approx(difference, rel=0.03)
+    assert slope == approx(difference, rel=0.03)
 
 
 # -- other views ------------------------------------------------------------------------------

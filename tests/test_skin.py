@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
@@ -83,7 +84,7 @@ def test_every_sensor_sees_the_world_from_its_own_frame(tiny: cs.Simulator) -> N
             inverse = pose.inverse()
             whole = cs.Scene([b.moved(inverse @ b.pose) for b in scene])
             expected = tiny.copy().step(whole).delta
-            assert readings[name].delta == pytest.approx(expected, rel=1e-4, abs=1e-19)
+            assert readings[name].delta == approx(expected, rel=1e-4, abs=1e-19)
         assert not readings["far"].delta.any()
 
 

@@ -8,6 +8,7 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.design import parse_design
@@ -41,7 +42,7 @@ def test_a_cover_lies_on_what_is_below_it() -> None:
     """The foam of the pad lies on its board, beside bars as high as itself."""
     design = cs.load_design("dual_pad")
     assert design.cover is not None
-    assert (design.cover.lower[2], design.cover.upper[2]) == pytest.approx((0.0, 0.002))
+    assert (design.cover.lower[2], design.cover.upper[2]) == approx((0.0, 0.002))
 
 
 @pytest.mark.parametrize(
@@ -91,14 +92,12 @@ def test_touch_is_the_foundation_s(name: str, pads: Pads) -> None:
     depth = 0.5 * min(cover.thickness, half**2 / (2 * FIST))  # stays on the cover
     touch = sim.step(fist(sim, -depth)).touch
     assert touch is not None
-    assert touch.total == pytest.approx(
-        np.pi * modulus * FIST * depth**2 / cover.thickness, rel=0.02
-    )
+    assert touch.total == approx(np.pi * modulus * FIST * depth**2 / cover.thickness, rel=0.02)
     assert 0.0 < touch.force.sum() <= touch.total * (1 + 1e-9)
     assert 0.5 * depth < touch.compression.max() <= depth * (1 + 1e-3)
     held = sim.step(fist(sim, 5e-3, force=touch.total)).touch
     assert held is not None
-    assert held.total == pytest.approx(touch.total, rel=1e-6)
+    assert held.total == approx(touch.total, rel=1e-6)
     np.testing.assert_allclose(held.compression, touch.compression, atol=0.06 * depth)
 
 

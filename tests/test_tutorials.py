@@ -11,6 +11,7 @@ from contextlib import chdir
 from pathlib import Path
 
 import pytest
+from approximate import approx
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = [DOCS / "getting_started.md", DOCS / "own_design.md", *sorted(DOCS.glob("tutorials/*.md"))]
@@ -45,7 +46,7 @@ def test_a_page_runs(
         found, shown = capsys.readouterr().out, blocks(page, "text")
         assert NUMBER.sub("#", found).split() == NUMBER.sub("#", shown).split()
         numbers = [[float(n) for n in NUMBER.findall(text)] for text in (found, shown)]
-        assert numbers[0] == pytest.approx(numbers[1], rel=0.03, abs=0.0101)  # a last digit
+        assert numbers[0] == approx(numbers[1], rel=0.03, abs=0.0101)  # a last digit
 
 
 def files(page: Path) -> dict[str, str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from approximate import approx
 from benchmark_modules import imported
 
 from capsense.reproduce import STUDIES
@@ -56,13 +57,13 @@ def assert_on_page(computed: str, absolute: float, relative: float = 0.02) -> No
         own = cells(line)
         there = by_two.get((own[0], own[1])) or lines.get(own[0])
         assert there is not None, f"the page lacks {line}"
-        assert numbers(there) == pytest.approx(numbers(line), abs=absolute, rel=relative), line
+        assert numbers(there) == approx(numbers(line), abs=absolute, rel=relative), line
 
 
 def test_disc_between_planes(validation: ModuleType) -> None:
     """Analytic: half-plane edges; the online solver 5 mm from the electrode."""
     for _, formula, found, _ in validation.disc_between_planes([0.005]):
-        assert float(found) == pytest.approx(float(formula), rel=0.02)
+        assert float(found) == approx(float(formula), rel=0.02)
 
 
 def test_references(validation: ModuleType) -> None:
@@ -80,7 +81,7 @@ def test_references(validation: ModuleType) -> None:
     by_case = {tuple(cells(x)[:2]): x for x in PAGE.splitlines() if x.startswith("|")}
     for line in lines[2:]:
         there = cells(by_case[tuple(cells(line)[:2])])
-        assert numbers(there[2]) == pytest.approx(numbers(cells(line)[2]), abs=0.05, rel=0.02)
+        assert numbers(there[2]) == approx(numbers(cells(line)[2]), abs=0.05, rel=0.02)
 
 
 def test_maps(validation: ModuleType) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 
@@ -49,9 +50,9 @@ def test_a_forearm_reads_as_its_shape_does(env: Env, tiny_simulator: cs.Simulato
     reading = sensor.read()
     tiny_simulator.reset()
     expected = tiny_simulator.step(cs.Scene([forearm(env, sensor, 0.033)])).delta
-    assert reading.delta == pytest.approx(expected, rel=1e-4)
+    assert reading.delta == approx(expected, rel=1e-4)
     flange = cs.Pose(*env.robot.get_pos_orient(env.robot.right_tool_joint))
-    assert sensor.pose.position == pytest.approx((flange @ NEAR).position, abs=1e-6)
+    assert sensor.pose.position == approx((flange @ NEAR).position, abs=1e-6)
 
 
 def test_it_follows_resets(env: Env, tiny_simulator: cs.Simulator) -> None:
@@ -66,13 +67,13 @@ def test_it_follows_resets(env: Env, tiny_simulator: cs.Simulator) -> None:
         counts = 0
         for k in range(1, 4):
             env.take_step()
-            assert sensor.time == pytest.approx(0.1 * k)
+            assert sensor.time == approx(0.1 * k)
             reading = sensor.read()
             counts += len(reading.counts.time)
         assert counts > 0
         tiny_simulator.reset()
         expected = tiny_simulator.step(cs.Scene([forearm(env, sensor, radius)])).delta
-        assert reading.delta == pytest.approx(expected, rel=1e-3)
+        assert reading.delta == approx(expected, rel=1e-3)
 
 
 def test_every_link_of_the_person_has_its_limb(env: Env, tiny_simulator: cs.Simulator) -> None:
@@ -111,11 +112,11 @@ def test_materials_and_grounding_by_limb(env: Env) -> None:
     assert bodies["human/right_hand"].material.name == "wet skin"
     assert bodies["human/chest"].material.name == "human"
     others = [b.grounding for b in bodies.values() if b.grounding != "grounded"]
-    assert sum(others) == pytest.approx(100e-12)  # type: ignore[arg-type]
+    assert sum(others) == approx(100e-12)  # type: ignore[arg-type]
     owned = cs.assistive_gym.attach(env, materials={"human": "skin"}, grounding={"human": 5e-12})
     person = [body for body in owned.scene() if str(body.name).startswith("human/")]
     assert {body.material.name for body in person} == {"skin"}
-    assert sum(body.grounding for body in person) == pytest.approx(5e-12)
+    assert sum(body.grounding for body in person) == approx(5e-12)
     with pytest.raises(cs.SceneError, match="nothing is named 'right_forarm'; did you mean"):
         cs.assistive_gym.attach(env, materials={"right_forarm": "skin"})
 
@@ -138,7 +139,7 @@ def test_where_it_can_be_attached(tiny_simulator: cs.Simulator) -> None:
     ):
         sensor = cs.assistive_gym.attach(Wrapped(), *arguments, design=tiny_simulator)
         expected = holder.get_pos_orient(link)
-        assert sensor.pose.position == pytest.approx(expected[0], abs=1e-6), arguments
+        assert sensor.pose.position == approx(expected[0], abs=1e-6), arguments
     with pytest.raises(cs.SceneError, match="no link named 'right_wrists'; did you mean"):
         cs.assistive_gym.attach(env, "human", "right_wrists")
     with pytest.raises(cs.SceneError, match="no agent with a body named 'tools'; did you mean"):

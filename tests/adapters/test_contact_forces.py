@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.adapters.contacts import Contact, pressed
@@ -121,8 +122,8 @@ def test_the_foam_carries_what_rests_on_it(world: Callable[..., Any]) -> None:
         ball.rest(push)
         reading = ball.sensor.read()
         assert reading.touch is not None
-        assert reading.touch.total == pytest.approx(MASS * GRAVITY + push, rel=0.02)
-        assert reading.touch.force[0] == pytest.approx(reading.touch.total, rel=0.03)
+        assert reading.touch.total == approx(MASS * GRAVITY + push, rel=0.02)
+        assert reading.touch.force[0] == approx(reading.touch.total, rel=0.03)
         found.append([reading.delta[0, 0], reading.touch.compression[0]])
     assert (np.diff(found, axis=0) > 0.0).all()
     ball.lift()
@@ -139,7 +140,7 @@ def test_substeps_of_bullet_count(simulator: cs.Simulator) -> None:
     touch = ball.sensor.read().touch
     ball.close()
     assert touch is not None
-    assert touch.total == pytest.approx(MASS * GRAVITY, rel=0.02)
+    assert touch.total == approx(MASS * GRAVITY, rel=0.02)
 
 
 def test_without_contact_forces_the_overlap_counts(world: Callable[..., Any]) -> None:
@@ -178,7 +179,7 @@ def test_which_contacts_count(foam: tuple[cs.Design, Any]) -> None:
     at, beside = (-0.012, 0.0, 0.002), (0.012, 0.0, 0.002)
     assert felt((7, at, up, 2.0, 0.0), (7, beside, up, 1.0, 0.0)) == [2.0, 1.0, None]
     assert felt((7, at, up, 2.0, 0.0), (7, at, up, 1.0, -1e-4)) == [3.0, None, None]
-    assert felt((7, at, (0.6, 0.0, 0.8), 1.0, 0.0))[0] == pytest.approx(0.8)
+    assert felt((7, at, (0.6, 0.0, 0.8), 1.0, 0.0))[0] == approx(0.8)
     assert felt((7, at, up, 0.0, 1e-4)) == [None] * 3  # within a margin
     assert felt((7, at, up, 0.0, -1e-4)) == [0.0, None, None]  # it overlaps, and is not held
     assert felt((7, at, down, 1.0, 0.0), (9, at, up, 1.0, 0.0)) == [None] * 3

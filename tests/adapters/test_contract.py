@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from adapter_worlds import Thing, Way, plain_reading
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import ReadoutError
@@ -95,7 +96,7 @@ def test_turning_everything(seed: int, way: Way, sensor_in: SensorIn) -> None:
     turned = [Thing(t.name, t.shape, motion @ t.pose) for t in things]
     sensor = sensor_in(turned, motion)
     assert difference(sensor.read(), at_rest) < way.moved
-    assert sensor.pose.apply((0, 0, 0.03)) == pytest.approx(motion.apply((0, 0, 0.03)), abs=1e-6)
+    assert sensor.pose.apply((0, 0, 0.03)) == approx(motion.apply((0, 0, 0.03)), abs=1e-6)
 
 
 @pytest.mark.parametrize("place", [(0.0605, 0.0, 0.02), (0.0, 0.0, -0.0205), (0.0, 0.0, 0.1005)])
@@ -190,7 +191,7 @@ def test_a_capacitance_to_ground_is_shared(
         Thing("arm_far", half, cs.Pose((0.5, 0, 0.03))),
     ]
     sensor = shapes_in(things, cs.Pose(), grounding={"arm_*": 3e-15})
-    assert [b.grounding for b in sensor.scene()] == pytest.approx([1.5e-15] * 2, abs=0)
+    assert [b.grounding for b in sensor.scene()] == approx([1.5e-15] * 2, abs=0)
     reading = sensor.read()
     pair = plain_reading(things[:2], cs.Pose(), tiny_simulator, grounding=1.5e-15)
     assert difference(reading, pair) < shape_way.same
@@ -214,7 +215,7 @@ def test_reading_shape_and_names(sensor_in: SensorIn, tiny_simulator: cs.Simulat
     sensor = sensor_in([Thing("ball", cs.Sphere(0.01), cs.Pose((0, 0, 0.03)))], cs.Pose())
     reading = sensor.read()
     assert sensor.electrode_names == tiny_simulator.electrode_names == reading.electrode_names
-    assert reading.capacitance == pytest.approx(sensor.baseline + reading.delta, abs=0)
+    assert reading.capacitance == approx(sensor.baseline + reading.delta, abs=0)
 
 
 # -- what sees depth images --------------------------------------------------------------------
@@ -228,8 +229,8 @@ def test_a_camera_inside_a_body(image_way: Way, image_in: SensorIn) -> None:
     if image_way.package == "pybullet":
         assert not frame.valid.any()
     else:
-        assert frame.points()[:, 2] == pytest.approx(np.full(frame.valid.sum(), 0.02), abs=1e-6)
-        assert frame.valid.mean() == pytest.approx(0.30, abs=0.02)
+        assert frame.points()[:, 2] == approx(np.full(frame.valid.sum(), 0.02), abs=1e-6)
+        assert frame.valid.mean() == approx(0.30, abs=0.02)
     assert np.isfinite(sensor.read().delta).all()
 
 
@@ -272,7 +273,7 @@ def test_an_open_mesh_is_taken(shape_way: Way, shapes_in: SensorIn) -> None:
     assert not body.shape.closed
     assert len(body.shape.faces) == len(faces)
     (body,) = shapes_in(things, cs.Pose(), hull=["wedge"], **own_surface).scene()
-    assert body.shape.volume == pytest.approx(WEDGE.volume, rel=1e-5)
+    assert body.shape.volume == approx(WEDGE.volume, rel=1e-5)
 
 
 def test_a_readout_may_be_a_file(sensor_in: SensorIn, tmp_path: Path) -> None:
@@ -282,7 +283,7 @@ def test_a_readout_may_be_a_file(sensor_in: SensorIn, tmp_path: Path) -> None:
     file.write_text('chip = "fdc1004"\nrate = 400\n', encoding="utf-8")
     for choice in (file, str(file)):
         sensor.use_readout(choice)
-        assert sensor.readout.schedule.conversion == pytest.approx(2.5e-3, rel=1e-12)
+        assert sensor.readout.schedule.conversion == approx(2.5e-3, rel=1e-12)
     with pytest.raises(ReadoutError, match="readout is 3; give a chip's name, a file, or a"):
         sensor.use_readout(3)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense import errors
@@ -78,7 +79,7 @@ def test_a_moving_block_reads_as_its_shape_does(
         assert server.stepping
         for k in range(1, 5):
             now = step()
-            assert now == pytest.approx(k * TIME_STEP)
+            assert now == approx(k * TIME_STEP)
             assert sensor.time == now
             reading = sensor.read()
             assert error(reading, tiny_simulator, cs.Body(BLOCK, place(now), "steel")) < 0.08
@@ -119,11 +120,11 @@ def test_the_red_channel_tells_materials(
     assert (np.isinf(frame.permittivity[0, 50, seen]) == (x[seen] > 0)).all()
     expected = tiny_simulator.step(by_hand).delta
     tiny_simulator.reset()
-    assert sensor.read().delta == pytest.approx(expected, rel=1e-3)
+    assert sensor.read().delta == approx(expected, rel=1e-3)
     late = put(server, "late_glass", pose=cs.Pose((0, 0.03, 0.03)))
     assert server.things[late].colour == UNPAINTED
     sensor.refresh()
-    assert server.things[late].colour == pytest.approx((5 / 255, 0, 0))
+    assert server.things[late].colour == approx((5 / 255, 0, 0))
     assert server.collections[
         server.things[sensor.vision_sensor.handle].parameters["entity_to_render"]
     ] == {screen}
@@ -140,14 +141,14 @@ def test_a_sensor_rides_on_its_object(
     sensor = cs.coppeliasim.attach(sim, "/Robot/flange/pad", tiny_simulator, pose_in_object=on_pad)
     sim.startSimulation()
     near = sensor.frame()
-    assert near.points()[:, 2].min() == pytest.approx(0.045 - 0.014 - 0.012, abs=2e-4)
+    assert near.points()[:, 2].min() == approx(0.045 - 0.014 - 0.012, abs=2e-4)
     server.things[flange].local @= cs.Pose((0, 0, -0.01))
-    assert sensor.pose.position == pytest.approx((server.pose(pad) @ on_pad).position)
-    assert sensor.pose.quaternion == pytest.approx((server.pose(pad) @ on_pad).quaternion)
+    assert sensor.pose.position == approx((server.pose(pad) @ on_pad).position)
+    assert sensor.pose.quaternion == approx((server.pose(pad) @ on_pad).quaternion)
     far = sensor.frame()
-    assert far.points()[:, 2].min() == pytest.approx(0.045 - 0.004 - 0.012, abs=2e-4)
+    assert far.points()[:, 2].min() == approx(0.045 - 0.004 - 0.012, abs=2e-4)
     own = cs.coppeliasim.attach(sim, pad, tiny_simulator, exclude_own=False)
-    assert own.frame().points()[:, 2].min() == pytest.approx(0.015, abs=1e-6)
+    assert own.frame().points()[:, 2].min() == approx(0.015, abs=1e-6)
 
 
 def test_attaching_again_replaces_what_was_made(
@@ -336,7 +337,7 @@ def test_a_collection_that_is_gone_is_made_anew(
     sim.startSimulation()
     before = sensor.read().delta
     server.collections.clear()
-    assert sensor.read().delta == pytest.approx(before)
+    assert sensor.read().delta == approx(before)
     (hidden,) = server.collections.values()
     assert hidden == {screen}
     server.collections.clear()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from adapter_worlds import Thing, load, numbers, plain_reading, urdf, urdf_geometry
+from approximate import approx
 
 import capsense as cs
 
@@ -145,10 +146,10 @@ def test_the_image_is_the_right_way_round(attached: Callable[..., Any]) -> None:
     for centre in places.values():
         near = points[np.linalg.norm(points - centre, axis=1) < 0.012]
         assert len(near) > 60
-        assert near[:, :2].mean(axis=0) == pytest.approx(centre[:2], abs=0.0003)
+        assert near[:, :2].mean(axis=0) == approx(centre[:2], abs=0.0003)
         radius = np.linalg.norm(near - centre, axis=1)  # PyBullet draws a polyhedron
-        assert radius == pytest.approx(np.full(len(near), 0.008), abs=0.0008)
-    assert sensor.pose.position == pytest.approx(SENSOR.position, abs=1e-6)
+        assert radius == approx(np.full(len(near), 0.008), abs=0.0008)
+    assert sensor.pose.position == approx(SENSOR.position, abs=1e-6)
 
 
 def test_an_empty_view_changes_nothing(attached: Callable[..., Any]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.adapters.meshes import Terrain, height_field
@@ -66,7 +67,7 @@ def test_a_floor_has_no_end(tiny_simulator: cs.Simulator) -> None:
     ):
         found.append(sensor_in(floor, fine).read().delta)
         assert np.abs(found[-1] - expected).max() < most * np.abs(expected).max()
-    assert found[1] == pytest.approx(found[0], rel=1e-6)
+    assert found[1] == approx(found[0], rel=1e-6)
     behind = sensor_in('<geom type="plane" size="0 0 .1" pos="0 0 -.5"/>', tiny_simulator)
     assert len(behind.scene()) == 0
 
@@ -101,9 +102,9 @@ def test_a_wide_terrain_is_seen_where_the_sensor_is(matter: str, most: float) ->
     mesh = cs.TriMesh(vertices, faces[:72] if matter == "steel" else faces)
     body = cs.Body(mesh, cs.Pose((0, 0, 0.15), (1, 0, 0, 0)), matter)
     expected = np.diag(cs.Simulator("six_patch", preset="fine").step(cs.Scene([body])).delta)
-    assert felt(0, 0) == pytest.approx(expected, rel=most, abs=0)
-    assert felt(12.0, -24.0) == pytest.approx(felt(0, 0), rel=1e-3, abs=0)
-    assert felt(-1e-3, 0) == pytest.approx(felt(1e-3, 0), rel=0.03, abs=0)
+    assert felt(0, 0) == approx(expected, rel=most, abs=0)
+    assert felt(12.0, -24.0) == approx(felt(0, 0), rel=1e-3, abs=0)
+    assert felt(-1e-3, 0) == approx(felt(1e-3, 0), rel=0.03, abs=0)
 
 
 def test_the_part_of_a_terrain_around_a_sensor() -> None:
@@ -150,7 +151,7 @@ def test_a_terrain_stands_where_mujoco_has_it(tiny_simulator: cs.Simulator) -> N
         except TypeError:
             depth = mujoco.mj_ray(sensor.model, sensor.data, point, down, only, 1, 1, geom, None)
         hit = point + depth * down
-        assert body.shape.signed_distance(body.pose.inverse().apply([hit]))[0] == pytest.approx(
+        assert body.shape.signed_distance(body.pose.inverse().apply([hit]))[0] == approx(
             0.0, abs=1e-8
         )
 
@@ -172,10 +173,10 @@ def test_signed_distance_geoms_and_shared_meshes(tiny_simulator: cs.Simulator) -
         )
     scene = sensor_in(world, tiny_simulator, top=top).scene()
     assert scene[0].shape is scene[1].shape
-    assert scene[0].shape.volume == pytest.approx(0.03**3 / 6, rel=1e-5)
+    assert scene[0].shape.volume == approx(0.03**3 / 6, rel=1e-5)
     if _has_torus():
         ring = scene["world/ring"].shape
-        assert ring.volume == pytest.approx(2 * np.pi**2 * 0.03 * 0.01**2, rel=0.01)
+        assert ring.volume == approx(2 * np.pi**2 * 0.03 * 0.01**2, rel=0.01)
 
 
 def _has_torus() -> bool:
@@ -356,8 +357,8 @@ def test_example_models_load(tmp_path: Path, tiny_simulator: cs.Simulator) -> No
     )  # fmt: skip
     (body,) = sensor.scene()
     corners = body.pose.apply(body.shape.vertices)
-    assert corners.min(axis=0) == pytest.approx(box.bounds[0], abs=1e-7)
-    assert corners.max(axis=0) == pytest.approx(box.bounds[1], abs=1e-7)
+    assert corners.min(axis=0) == approx(box.bounds[0], abs=1e-7)
+    assert corners.max(axis=0) == approx(box.bounds[1], abs=1e-7)
 
 
 @pytest.mark.parametrize(("drawn", "seen", "warned"), [("obj", 14, 1), ("stl", 7, 0)])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 
@@ -43,9 +44,9 @@ def test_a_site_is_where_it_was_asked_for(tiny_simulator: cs.Simulator) -> None:
     name = cs.mujoco.add_sensor(spec, "link", ON_LINK)
     place = cs.Pose((0.004, -0.006, 0.04))
     sensor = cs.mujoco.attach(*build(spec, place), name, tiny_simulator)
-    assert sensor.pose.position == pytest.approx((spec_pose(spec) @ ON_LINK).position)
+    assert sensor.pose.position == approx((spec_pose(spec) @ ON_LINK).position)
     (ball,) = sensor.scene()
-    assert ball.pose.position == pytest.approx(place.position)
+    assert ball.pose.position == approx(place.position)
     assert np.diag(sensor.read().delta).min() > 1e-15
 
 
@@ -59,9 +60,9 @@ def test_a_camera_looks_along_the_sensor(tiny_simulator: cs.Simulator) -> None:
     (depth,) = sensor.frame().depth
     assert depth.shape == (32, 32)
     row, column = np.unravel_index(np.argmin(np.where(depth > 0, depth, 9)), depth.shape)
-    assert depth[row, column] == pytest.approx(0.03, abs=5e-4)
+    assert depth[row, column] == approx(0.03, abs=5e-4)
     points = sensor.frame().camera.pose.apply(((column - 15.5) * 0.1 / 32, 0, 0))
-    assert points[0] == pytest.approx(0.02, abs=4e-3)
+    assert points[0] == approx(0.02, abs=4e-3)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from adapter_worlds import load, numbers, urdf
+from approximate import approx
 
 import capsense as cs
 
@@ -49,7 +50,7 @@ def place(client: int, pose: cs.Pose | None = None, **shape: Any) -> int:
 def same(found: Any, expected: Any) -> None:
     """Two primitives of one kind and size."""
     assert found.kind is expected.kind
-    assert found.params == pytest.approx(expected.params, rel=1e-9)
+    assert found.params == approx(expected.params, rel=1e-9)
 
 
 def test_every_primitive_has_its_size(client: int, attach: Callable[..., Any]) -> None:
@@ -108,10 +109,10 @@ def test_a_urdf_stands_where_its_file_says(
     scene = attach(shapes=shapes).scene()
     assert {b.name for b in scene} == set(expected)
     for name, where in expected.items():
-        assert scene[name].pose.matrix == pytest.approx(where.matrix, abs=1e-6)
+        assert scene[name].pose.matrix == approx(where.matrix, abs=1e-6)
     fore = scene["arm/fore"].shape
     assert isinstance(fore, cs.Cylinder)
-    assert (fore.radius, fore.length) == pytest.approx((0.008, 0.02), rel=1e-5)
+    assert (fore.radius, fore.length) == approx((0.008, 0.02), rel=1e-5)
 
 
 def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
@@ -124,8 +125,8 @@ def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
     ball, box = attach().scene()
     same(ball.shape, cs.Sphere(0.01))
     same(box.shape, cs.Box((0.01, 0.01, 0.01)))
-    assert ball.pose.position == pytest.approx((0.01, 0, 0.04), abs=1e-12)
-    assert box.pose.position == pytest.approx((-0.01, 0, 0.05), abs=1e-12)
+    assert ball.pose.position == approx((0.01, 0, 0.04), abs=1e-12)
+    assert box.pose.position == approx((-0.01, 0, 0.05), abs=1e-12)
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (0.6, 0, 0.8), (0, 1, 0)])
@@ -161,8 +162,8 @@ def test_meshes_without_a_file(client: int, attach: Callable[..., Any]) -> None:
     corners = [[0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02]]
     place(client, shapeType=p.GEOM_MESH, vertices=corners)
     (body,) = attach().scene()
-    assert body.shape.volume == pytest.approx(0.02**3 / 6, rel=1e-4)
-    assert body.pose.apply(body.shape.bounds()) == pytest.approx(
+    assert body.shape.volume == approx(0.02**3 / 6, rel=1e-4)
+    assert body.pose.apply(body.shape.bounds()) == approx(
         np.array([AHEAD, (0.02, 0.02, 0.06)]), abs=1e-7
     )
     faces = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
@@ -211,7 +212,7 @@ def test_bodies_that_come_and_go(client: int, attach: Callable[..., Any]) -> Non
     p.removeBody(ball, physicsClientId=client)
     assert sensor.read().delta[0, 0] == 0
     place(client, shapeType=p.GEOM_SPHERE, radius=0.01)
-    assert sensor.read().delta[0, 0] == pytest.approx(near, rel=1e-3, abs=0)
+    assert sensor.read().delta[0, 0] == approx(near, rel=1e-3, abs=0)
 
 
 def test_clients_are_kept_apart(attach: Callable[..., Any], client: int) -> None:

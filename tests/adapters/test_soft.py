@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 
@@ -102,7 +103,7 @@ def test_a_flat_flex_reads_as_a_plate(tiny_simulator: cs.Simulator) -> None:
     assert len(body.shape.faces) == 32
     assert sensor.scene()[0].shape.faces is body.shape.faces
     box = plain(tiny_simulator, cs.Box((SHEET, SHEET, 0.0002)))
-    assert np.diag(sensor.read().delta) == pytest.approx(np.diag(box.delta), rel=0.03, abs=0)
+    assert np.diag(sensor.read().delta) == approx(np.diag(box.delta), rel=0.03, abs=0)
 
 
 def test_a_falling_flex_is_followed(tiny_simulator: cs.Simulator) -> None:
@@ -129,9 +130,9 @@ def test_a_solid_flex_is_filled(tiny_simulator: cs.Simulator) -> None:
     tiny_simulator.reset()
     sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
     shape = cs.Box((0.045, 0.045, 0.02))
-    assert sensor.scene()[0].shape.volume == pytest.approx(shape.volume, rel=1e-6)
+    assert sensor.scene()[0].shape.volume == approx(shape.volume, rel=1e-6)
     found, box = sensor.read(), plain(tiny_simulator, shape)
-    assert np.diag(found.delta) == pytest.approx(np.diag(box.delta), rel=0.03, abs=0)
+    assert np.diag(found.delta) == approx(np.diag(box.delta), rel=0.03, abs=0)
 
 
 def test_flexes_are_excluded_and_refused_by_name(tiny_simulator: cs.Simulator) -> None:
@@ -159,7 +160,7 @@ def test_a_soft_sheet_reads_as_a_plate(
     assert body.name.startswith("soft")
     assert not body.shape.closed
     box = plain(tiny_simulator, cs.Box((SHEET, SHEET, 0.0002)))
-    assert np.diag(sensor.read().delta) == pytest.approx(np.diag(box.delta), rel=0.03, abs=0)
+    assert np.diag(sensor.read().delta) == approx(np.diag(box.delta), rel=0.03, abs=0)
 
 
 def test_a_closed_soft_body_is_filled(
@@ -171,9 +172,9 @@ def test_a_closed_soft_body_is_filled(
     sensor = soft_in_pybullet(
         soft_client, (mesh.vertices, mesh.faces), tmp_path, tiny_simulator, True
     )
-    assert sensor.scene()[0].shape.volume == pytest.approx(shape.volume, rel=0.05)
+    assert sensor.scene()[0].shape.volume == approx(shape.volume, rel=0.05)
     found = np.diag(sensor.read().delta)
-    assert found == pytest.approx(np.diag(plain(tiny_simulator, shape).delta), rel=0.03, abs=0)
+    assert found == approx(np.diag(plain(tiny_simulator, shape).delta), rel=0.03, abs=0)
 
 
 def test_a_soft_body_must_have_been_stepped(

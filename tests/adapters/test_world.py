@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.adapters.meshes import height_field, joined_hulls, load_triangles, round_cylinder
@@ -75,7 +76,7 @@ def test_against_chained_poses() -> None:
                 assert apart.any()
                 left_out += 1
             else:
-                assert found.matrix == pytest.approx(expected.matrix, abs=1e-12)
+                assert found.matrix == approx(expected.matrix, abs=1e-12)
     assert 100 < left_out < 700
 
 
@@ -123,12 +124,12 @@ def test_height_field_is_closed_and_of_the_right_volume() -> None:
     """Analytic: a tilted plane over a slab."""
     x = np.linspace(0, 0.1, 6)
     shape = cs.TriMesh(*height_field(np.tile(x, (4, 1)), (0.3, 0.2), 0.05))
-    assert shape.volume == pytest.approx(0.6 * 0.4 * (0.05 + 0.05))
-    assert shape.bounds() == pytest.approx(np.array([[-0.3, -0.2, -0.05], [0.3, 0.2, 0.1]]))
+    assert shape.volume == approx(0.6 * 0.4 * (0.05 + 0.05))
+    assert shape.bounds() == approx(np.array([[-0.3, -0.2, -0.05], [0.3, 0.2, 0.1]]))
     rows = np.zeros((3, 3))
     rows[2, 0] = 0.1  # last row is +y, first column is −x
     vertices, _ = height_field(rows, (1.0, 1.0), 1.0)
-    assert vertices[vertices[:, 2].argmax()] == pytest.approx((-1.0, 1.0, 0.1))
+    assert vertices[vertices[:, 2].argmax()] == approx((-1.0, 1.0, 0.1))
 
 
 def test_hulls_are_taken_part_by_part() -> None:
@@ -144,7 +145,7 @@ def test_hulls_are_taken_part_by_part() -> None:
     both = np.vstack([dented, np.add(dented, (0.5, 0, 0)), stray])
     every = np.vstack([faces, np.add(faces, 9), [[18, 19, 20]]])
     shape = cs.TriMesh(*joined_hulls(both, every, "boxes"))
-    assert shape.volume == pytest.approx(2e-3)
+    assert shape.volume == approx(2e-3)
     with pytest.raises(cs.SceneError, match="'flat' has no part with a volume"):
         joined_hulls(stray, [[0, 1, 2]], "flat")
 
@@ -156,7 +157,7 @@ def test_a_prism_of_bullet_is_a_cylinder() -> None:
     prism = np.vstack([np.column_stack([ring, np.full(32, z)]) for z in (-0.1, 0.1)])
     found = round_cylinder(prism)
     assert found is not None
-    assert (found.radius, found.length) == pytest.approx((0.05, 0.2))
+    assert (found.radius, found.length) == approx((0.05, 0.2))
     assert round_cylinder(prism[:40]) is None
     assert round_cylinder(prism * (1.0, 1.1, 1.0)) is None
 

@@ -10,6 +10,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from approximate import approx
 from benchmark_modules import imported
 
 from capsense.design import parse_design
@@ -57,23 +58,23 @@ def test_lowest_point_of_a_tilted_capsule(parts: dict[str, ModuleType]) -> None:
     half = np.sqrt(0.5)
     body = {"shape": "capsule", "size": [0.01, 0.04], "position": [0, 0, 0.05],
             "quaternion": [0, np.sin(np.pi / 6), 0, np.cos(np.pi / 6)]}  # fmt: skip
-    assert parts["near_map"].lowest(body) == pytest.approx(0.05 - 0.01 - 0.02 * 0.5)
+    assert parts["near_map"].lowest(body) == approx(0.05 - 0.01 - 0.02 * 0.5)
     body["quaternion"] = [0, half, 0, half]
-    assert parts["near_map"].lowest(body) == pytest.approx(0.04)
+    assert parts["near_map"].lowest(body) == approx(0.04)
 
 
 @pytest.mark.parametrize("k", [0.02, 0.25])
 def test_discs_of_the_script_are_those_of_love(parts: dict[str, ModuleType], k: float) -> None:
     exact = {row[0]: row[1] for row in parts["near_map"].love_table()}[k]
-    assert parts["near_map"].disc_and_body(k, 0.0, 80) == pytest.approx(exact, rel=1e-3)
+    assert parts["near_map"].disc_and_body(k, 0.0, 80) == approx(exact, rel=1e-3)
     thin = parts["near_map"].disc_and_body(k, 1e-4, 80)
     assert exact < parts["near_map"].disc_and_body(k, 0.1, 80) * 1.001
-    assert thin == pytest.approx(exact, rel=3e-3)
+    assert thin == approx(exact, rel=3e-3)
 
 
 def test_boundary_elements_of_references_give_discs_of_love(parts: dict[str, ModuleType]) -> None:
     exact = {row[0]: row[1] for row in parts["near_map"].love_table()}[0.05]
-    assert parts["near_reference"].exact_discs(0.05, 1.7) == pytest.approx(exact, rel=0.01)
+    assert parts["near_reference"].exact_discs(0.05, 1.7) == approx(exact, rel=0.01)
 
 
 def test_random_designs_can_be_built(parts: dict[str, ModuleType]) -> None:
@@ -85,6 +86,6 @@ def test_random_designs_can_be_built(parts: dict[str, ModuleType]) -> None:
             body = reference.random_body(design, what, rng)
             gap = reference.lowest(body)[2] - parts["near_map"].top(design)
             assert 4.9e-5 < gap < 5.1e-3
-            assert gap == pytest.approx(
+            assert gap == approx(
                 parts["near_map"].lowest(body) - parts["near_map"].top(design), abs=1e-8
             )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from benchmark_modules import imported
 
 
@@ -45,7 +46,7 @@ def test_the_distance_model_is_right_at_the_set_distance(policy: Any) -> None:
     poses = policy.LimbPose(), policy.LimbPose(vertical=0.09)
     scenes = [policy.PoseEstimator(env.simulator).scene(p, policy.Belief().radius) for p in poses]
     near, far = (float(plates.read(scene).sum()) for scene in scenes)
-    assert near == pytest.approx(env.simulator.step(scenes[0]).delta.trace(), rel=1e-12)
+    assert near == approx(env.simulator.step(scenes[0]).delta.trace(), rel=1e-12)
     assert far < near
     (reading,) = env.skin.read().values()
     assert np.all(np.diag(reading.delta) > 0)

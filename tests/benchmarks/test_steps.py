@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from benchmark_modules import imported
 
 import capsense as cs
@@ -44,7 +45,7 @@ def test_bodies_are_where_the_name_says(
         if name == "12 far":
             scene = next(w for w in worlds if "far" in w.name).sample(k)
         assert len(scene) == count
-        assert lowest(scene) == pytest.approx(gap, abs=1e-9)
+        assert lowest(scene) == approx(gap, abs=1e-9)
 
 
 def test_the_person_is_one_closed_mesh(parts: dict[str, ModuleType]) -> None:
@@ -53,7 +54,7 @@ def test_the_person_is_one_closed_mesh(parts: dict[str, ModuleType]) -> None:
     assert 19_000 < len(mesh.faces) < 22_000
     assert mesh.closed
     low, high = mesh.bounds()
-    assert low[2] == pytest.approx(0.020, abs=1e-3)
+    assert low[2] == approx(0.020, abs=1e-3)
     assert high[2] > 0.5
 
 

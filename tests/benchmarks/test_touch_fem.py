@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from benchmark_modules import imported
 
 from capsense.constants import EPS0
@@ -76,12 +77,12 @@ def test_flat_body_at_high_pressure_is_a_plate_capacitor(touch: ModuleType) -> N
 def test_fabric_counts_by_its_integral(touch: ModuleType) -> None:
     """The fabric hides the body until it is pressed in; then ε0 ε [1/length − 1/t] counts."""
     case, values = case_of(touch, "fabric"), by_strain(touch, "fabric")
-    assert values[0.0] == pytest.approx(touch.known()["fabric"]["far_fF"] * 1e-15, rel=1e-4)
+    assert values[0.0] == approx(touch.known()["fabric"]["far_fF"] * 1e-15, rel=1e-4)
     errors = []
     for strain in (0.3, 0.5, 0.7):
         law = touch.local_changes(case, strain * case.thickness)
         errors.append(law["pressed up"] / (values[strain] - values[0.0]) - 1)
-    assert errors[2] == pytest.approx(0.0, abs=0.03)
+    assert errors[2] == approx(0.0, abs=0.03)
     assert 0 < errors[2] < errors[1] < errors[0]  # the rim's field is less than that of plates
 
 
@@ -89,7 +90,7 @@ def test_local_laws_of_a_flat_body_are_those_of_plates(touch: ModuleType) -> Non
     case = case_of(touch, "punch")
     t, area = case.thickness, math.pi * case.radius**2
     for law, change in touch.local_changes(case, 0.5 * t).items():
-        assert change == pytest.approx(EPS0 * case.eps_r * area / t, rel=1e-9), law
+        assert change == approx(EPS0 * case.eps_r * area / t, rel=1e-9), law
 
 
 @pytest.mark.parametrize("name", ["ball", "punch"])
@@ -106,14 +107,12 @@ def test_ways_are_those_to_the_outline(parts: dict[str, ModuleType], name: str) 
     for k, radius in enumerate(r):
         distance = np.hypot(points[:, 0] - radius, points[:, 1])
         nearest = points[distance.argmin()]
-        assert ways.nearest[k] == pytest.approx(distance.min(), rel=1e-6)
-        assert abs(math.atan2(nearest[0] - radius, nearest[1])) == pytest.approx(
-            ways.angle[k], abs=2e-3
-        )
+        assert ways.nearest[k] == approx(distance.min(), rel=1e-6)
+        assert abs(math.atan2(nearest[0] - radius, nearest[1])) == approx(ways.angle[k], abs=2e-3)
         below = points[points[:, 1] < low + case.body_radius / 20 + 2 * case.edge]
         if not case.edge or radius < case.body_radius - case.edge:
             height = np.interp(radius, *points[: len(below)].T)
-            assert ways.up[k] == pytest.approx(height, rel=1e-3) or radius > below[:, 0].max()
+            assert ways.up[k] == approx(height, rel=1e-3) or radius > below[:, 0].max()
 
 
 def test_scenes_place_the_body_over_designs_that_load(touch: ModuleType) -> None:
@@ -124,7 +123,7 @@ def test_scenes_place_the_body_over_designs_that_load(touch: ModuleType) -> None
             assert design.electrode_names == ("E",)
             top = max(layer.upper[2] for layer in design.layers)
             half = case.length / 2 if case.edge else case.body_radius
-            assert body.pose.position[2] - half == pytest.approx(top - depth, abs=1e-12)
+            assert body.pose.position[2] - half == approx(top - depth, abs=1e-12)
         assert touch.scene(case, None)[1] == []
         (cover,) = touch.scene(case, None)[0]["cover"]
         assert cover["top"] == ("ground" if case.fabric else "none")
@@ -136,7 +135,7 @@ def test_cylinder_with_rounded_edges_is_closed_and_of_its_size(touch: ModuleType
     size = np.ptp(body.vertices, axis=0)
     np.testing.assert_allclose(size, [2 * case.body_radius] * 2 + [case.length], rtol=1e-9)
     lowest = body.vertices[body.vertices[:, 2] < -case.length / 2 + 1e-9]
-    assert np.hypot(*lowest[:, :2].T).max() == pytest.approx(case.body_radius - case.edge)
+    assert np.hypot(*lowest[:, :2].T).max() == approx(case.body_radius - case.edge)
 
 
 @pytest.mark.parametrize("eps_r", [1.0, 3.0])
@@ -149,7 +148,7 @@ def test_finite_elements_give_a_disc_on_a_dielectric(
     a, far = 1e-3, 0.2
     section = reference.Section(a, 0.99 * far, eps_r, extent=0.99 * far, domain=(far, -far, far))
     found = reference.solve(section, tolerance=1e-3)
-    assert found.own == pytest.approx(4 * EPS0 * (1 + eps_r) * a, rel=6e-3)
+    assert found.own == approx(4 * EPS0 * (1 + eps_r) * a, rel=6e-3)
     assert found.own > 4 * EPS0 * (1 + eps_r) * a
     assert found.error < 2e-3 * found.own
 
@@ -164,6 +163,6 @@ def test_finite_elements_give_a_ball_and_its_charge_by_a_small_disc(
     outline = reference.ball(radius, gap)
     section = reference.Section(a, 0.0, outline=outline, extent=0.01, domain=(far, -far, far))
     found = reference.solve(section, tolerance=1e-3)
-    assert found.body == pytest.approx(4 * math.pi * EPS0 * radius, rel=0.02)
-    assert found.mutual == pytest.approx(-8 * EPS0 * a * radius / (gap + radius), rel=0.02)
+    assert found.body == approx(4 * math.pi * EPS0 * radius, rel=0.02)
+    assert found.mutual == approx(-8 * EPS0 * a * radius / (gap + radius), rel=0.02)
     assert found.own - found.mutual**2 / found.body == found.floating

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 from field_cases import delta_reference
 
 from capsense.__main__ import main
@@ -47,7 +48,7 @@ def test_errors_are_of_the_world_itself(name: str) -> None:
     first = check_error(sim, name)
     for other in CHECKS:
         check_error(sim, other)
-    assert check_error(sim, name) == pytest.approx(first, abs=1e-4)
+    assert check_error(sim, name) == approx(first, abs=1e-4)
 
 
 def test_scenes_of_a_batch_differ() -> None:

@@ -9,6 +9,7 @@ from inspect import cleandoc
 from pathlib import Path
 
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import COMMANDS, build_parser, main
@@ -60,7 +61,7 @@ def test_figures_and_baseline(capsys: pytest.CaptureFixture[str]) -> None:
     ):
         cells = line.split()
         assert cells[0] == name
-        assert [float(c) for c in cells[1:]] == pytest.approx(row * 1e12, abs=5e-5)
+        assert [float(c) for c in cells[1:]] == approx(row * 1e12, abs=5e-5)
     assert len({len(line) for line in matrix}) == 1
 
 
@@ -81,9 +82,7 @@ def test_guarded_self_capacitance(capsys: pytest.CaptureFixture[str]) -> None:
     """Designs with a driven shield print what a self-mode channel measures, others nothing more."""
     reading = cs.Simulator("arm_segment").step(cs.Scene())
     last = output_of(["design", "arm_segment"], capsys).splitlines()[-1]
-    assert [float(x) for x in last.split()] == pytest.approx(
-        reading.self_capacitance * 1e12, abs=5e-5
-    )
+    assert [float(x) for x in last.split()] == approx(reading.self_capacitance * 1e12, abs=5e-5)
     assert "shields driven" not in output_of(["design", "six_patch"], capsys)
 
 

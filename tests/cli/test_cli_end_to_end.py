@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "capsense"]
@@ -32,7 +33,7 @@ def test_run(tmp_path: Path) -> None:
     capacitance = arrays["capacitance"]
     assert capacitance.shape == (12, 6, 6)
     scale = np.abs(capacitance).max()
-    assert capacitance == pytest.approx(capacitance.transpose(0, 2, 1), abs=1e-6 * scale)
+    assert capacitance == approx(capacitance.transpose(0, 2, 1), abs=1e-6 * scale)
     off = capacitance[:, ~np.eye(6, dtype=bool)]
     assert off.max() <= 1e-3 * scale
     assert capacitance.sum(axis=2).min() >= -1e-3 * scale

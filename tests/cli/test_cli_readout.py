@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 from ball_scenario import ball_scenario
 from maxwell import random_maxwell
 from relative import near
@@ -61,7 +62,7 @@ def test_tables_hold_what_python_gives(run, capsys):
     assert len(rows) == len(counts) > 300
     assert [int(r["code"]) for r in rows] == counts.code.tolist()
     assert [r["channel"] for r in rows] == [names[c] for c in counts.channel]
-    assert [float(r["time_s"]) for r in rows] == pytest.approx(counts.time, abs=1e-9)
+    assert [float(r["time_s"]) for r in rows] == approx(counts.time, abs=1e-9)
     assert "E1" in capsys.readouterr().out
 
 
@@ -94,7 +95,7 @@ def test_matrices_are_put_together_right(tmp_path):
     assert recording.electrodes == names
     bank = ChannelBank(mutual_patterns(names), names)
     expected = [[-c[i, j] for i, j in pairs if i != j] for c in matrices]
-    assert recording.channels(bank) == pytest.approx(np.array(expected), rel=1e-12, abs=0)
+    assert recording.channels(bank) == approx(np.array(expected), rel=1e-12, abs=0)
     assert (recording.empty_channels(bank) == recording.channels(bank)[0]).all()
 
 
@@ -104,7 +105,7 @@ def test_shields_count_as_recorded(run):
     recording = load_recording(folder)
     bank = ChannelBank(self_patterns(recording.electrodes), recording.electrodes)
     columns = np.stack([recording.columns[f"C_{n}"] for n in recording.electrodes], axis=1)
-    assert recording.channels(bank) == pytest.approx(columns, rel=1e-12, abs=0)
+    assert recording.channels(bank) == approx(columns, rel=1e-12, abs=0)
 
 
 def test_driven_shields_are_read_from_a_matrix_recording(run):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from ball_scenario import ball_scenario
 
 import capsense as cs
@@ -53,29 +54,29 @@ def test_all_files_agree(
     arrays = np.load(out / "readings.npz", allow_pickle=False)
     assert len(rows) == COUNT
     assert arrays["capacitance"].shape == (COUNT, 6, 6)
-    assert arrays["delta"] == pytest.approx(arrays["capacitance"] - arrays["baseline"], abs=1e-24)
-    assert arrays["body_positions"][:, 0, 0] == pytest.approx(np.linspace(-0.06, 0.06, COUNT))
+    assert arrays["delta"] == approx(arrays["capacitance"] - arrays["baseline"], abs=1e-24)
+    assert arrays["body_positions"][:, 0, 0] == approx(np.linspace(-0.06, 0.06, COUNT))
     assert arrays["body_names"].tolist() == ["ball"]
     assert arrays["electrode_names"].tolist() == [f"E{k}" for k in range(1, 7)]
     for k, row in enumerate(rows):
-        assert row["time_s"] == pytest.approx(k / 10)
+        assert row["time_s"] == approx(k / 10)
         for i in range(6):
             for j in range(i, 6):
                 value = row[f"C_E{i + 1}_E{j + 1}_F"]
-                assert value == pytest.approx(arrays["capacitance"][k, i, j], rel=1e-9)
+                assert value == approx(arrays["capacitance"][k, i, j], rel=1e-9)
                 change = row[f"dC_E{i + 1}_E{j + 1}_F"]
-                assert change == pytest.approx(arrays["delta"][k, i, j], rel=1e-6, abs=1e-22)
+                assert change == approx(arrays["delta"][k, i, j], rel=1e-6, abs=1e-22)
     assert list(rows[0]) == list(summary["columns"])
     assert summary["samples"] == summary["samples_planned"] == COUNT
     assert (summary["interrupted"], summary["failure"]) == (False, None)
-    assert summary["largest_error_estimate_F"] == pytest.approx(4e-18)
+    assert summary["largest_error_estimate_F"] == approx(4e-18)
     assert summary["field"]["boundary panels"] == 3456
     assert summary["unknowns"]["median"] == 120
     assert summary["versions"]["capsense"] == cs.__version__
     first = summary["channels"][0]
     column = [row["C_E1_E1_F"] for row in rows]
-    assert (first["min_F"], first["max_F"]) == pytest.approx((min(column), max(column)))
-    assert first["baseline_F"] == pytest.approx(arrays["baseline"][0, 0])
+    assert (first["min_F"], first["max_F"]) == approx((min(column), max(column)))
+    assert first["baseline_F"] == approx(arrays["baseline"][0, 0])
     assert (out / "plot.png").read_bytes().startswith(b"\x89PNG")
     text, errors = capsys.readouterr()
     assert "C_E5_E6" in text
@@ -101,7 +102,7 @@ def test_the_error_is_the_largest_of_the_solver_s_estimates(
         errors.append(sim.step(cs.Scene([ball])).stats.solver_error)
     np.testing.assert_allclose(arrays["error_estimate"], errors, rtol=1e-6)
     assert max(errors) > 1.2 * min(errors)
-    assert told == pytest.approx(max(errors), rel=1e-6)
+    assert told == approx(max(errors), rel=1e-6)
     assert f"error      {told:.2g} F, the largest of the estimates" in capsys.readouterr().out
 
 

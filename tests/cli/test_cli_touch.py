@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import main
@@ -37,8 +38,8 @@ def test_a_run_tells_of_touch(
     lines = capsys.readouterr().out.splitlines()
     assert any(line.split()[:3] == ["whole", "cover", "0.5"] for line in lines)
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["touch"]["largest_total_N"] == pytest.approx(0.5)
-    assert summary["touch"]["largest_force_N"] == pytest.approx([0.5, 0.0], rel=0.05)
+    assert summary["touch"]["largest_total_N"] == approx(0.5)
+    assert summary["touch"]["largest_force_N"] == approx([0.5, 0.0], rel=0.05)
     assert summary["columns"]["force_A_N"] == "force that the cover carries above A, N"
     with (out / "readings.csv").open() as table:
-        assert float(next(csv.DictReader(table))["force_total_N"]) == pytest.approx(0.5)
+        assert float(next(csv.DictReader(table))["force_total_N"]) == approx(0.5)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from approximate import approx
 
 from capsense.design import Design, Surface, load_design, parse_design
 from capsense.design.geometry import find_contact, ring_vertices
@@ -55,9 +56,9 @@ def test_bending_keeps_area_and_outline(keys: dict[str, Any]) -> None:
     """Analytic: a film that is bent keeps its area and the length of its rims."""
     flat = design(keys, radius=None).electrodes[0].surface
     curved = bent(**keys)
-    assert curved.area == pytest.approx(flat.area, rel=1e-9)
+    assert curved.area == approx(flat.area, rel=1e-9)
     length = [np.linalg.norm(s.rims[:, 1] - s.rims[:, 0], axis=1).sum() for s in (flat, curved)]
-    assert length[1] == pytest.approx(length[0], rel=1e-9)
+    assert length[1] == approx(length[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("z", [0.0, -0.01, 0.004])
@@ -68,9 +69,9 @@ def test_a_bent_rectangle_lies_on_its_cylinder(z: float) -> None:
     for points in (vertices(surface), middles, surface.rims.reshape(-1, 3)):
         assert np.abs(distance(points) - (RADIUS + z)).max() < 1.1 * STRIP_ERROR
     angle = np.arctan2(vertices(surface)[:, 0], vertices(surface)[:, 2] + RADIUS)
-    assert angle.min() == pytest.approx(-0.02 / RADIUS, abs=1e-9)
-    assert angle.max() == pytest.approx(0.04 / RADIUS, abs=1e-9)
-    assert surface.bounds[:, 1] == pytest.approx([0.005, 0.035])
+    assert angle.min() == approx(-0.02 / RADIUS, abs=1e-9)
+    assert angle.max() == approx(0.04 / RADIUS, abs=1e-9)
+    assert surface.bounds[:, 1] == approx([0.005, 0.035])
 
 
 def test_strips_meet_and_their_normals_point_outward() -> None:
@@ -80,7 +81,7 @@ def test_strips_meet_and_their_normals_point_outward() -> None:
     corners = np.round(vertices(surface), 9)
     assert len(np.unique(corners, axis=0)) == 2 * (len(surface.facets) + 1)
     for facet in surface.facets:
-        assert np.cross(facet.axes[0], facet.axes[1]) == pytest.approx(facet.axes[2])
+        assert np.cross(facet.axes[0], facet.axes[1]) == approx(facet.axes[2])
         assert facet.axes[2] @ (facet.origin - [0, 0, -RADIUS]) > 0
         assert facet.polygon.exterior.is_ccw
 
@@ -92,7 +93,7 @@ def test_clearance_is_cut_before_bending() -> None:
     keys = {"shape": "rectangle", "size": [0.02, 0.02]}
     flat = design(keys, radius=None, conductor=[pour])
     curved = design(keys, conductor=[pour])
-    assert curved.conductors[0].surface.area == pytest.approx(flat.conductors[0].surface.area)
+    assert curved.conductors[0].surface.area == approx(flat.conductors[0].surface.area)
     assert find_contact(curved.electrodes[0].surface, curved.conductors[0].surface) is None
 
 
@@ -106,7 +107,7 @@ def test_what_is_not_level_is_not_bent() -> None:
     keys = {"shape": "rectangle", "size": [0.02, 0.02]}
     flat, curved = (design(keys, radius=r, conductor=other) for r in (None, RADIUS))
     for a, b in zip(flat.conductors, curved.conductors, strict=True):
-        assert b.surface.bounds == pytest.approx(a.surface.bounds)
+        assert b.surface.bounds == approx(a.surface.bounds)
     assert flat.content_hash() != curved.content_hash()
 
 
@@ -123,20 +124,20 @@ def test_a_cylinder_is_closed_and_of_the_right_size() -> None:
     surface = cylinder()
     mantle = [f for f in surface.facets if abs(f.axes[2, 2]) < 0.5]
     caps = [f for f in surface.facets if abs(f.axes[2, 2]) > 0.5]
-    assert sum(f.polygon.area for f in mantle) == pytest.approx(math.tau * 0.04 * 0.1, rel=1e-9)
-    assert [f.polygon.area for f in caps] == pytest.approx([math.pi * 16e-4] * 2, rel=5e-3)
+    assert sum(f.polygon.area for f in mantle) == approx(math.tau * 0.04 * 0.1, rel=1e-9)
+    assert [f.polygon.area for f in caps] == approx([math.pi * 16e-4] * 2, rel=5e-3)
     out = np.hypot(*vertices(surface)[:, :2].T)
     assert np.abs(out - 0.04).max() < 1.1 * STRIP_ERROR
     triangles = surface.triangles
     volume = np.einsum("ni,ni->n", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2]))
-    assert abs(volume.sum()) / 6 == pytest.approx(math.pi * 16e-4 * 0.1, rel=5e-3)
+    assert abs(volume.sum()) / 6 == approx(math.pi * 16e-4 * 0.1, rel=5e-3)
 
 
 def test_a_cylinder_may_lie_along_y() -> None:
     """Differential: turned by 90° about x, as the packaged arm segment uses it."""
     upright, lying = cylinder(), cylinder(tilt=[90, 0, 0])
-    assert np.ptp(lying.bounds, axis=0) == pytest.approx(np.ptp(upright.bounds, axis=0)[[0, 2, 1]])
-    assert lying.bounds.mean(axis=0) == pytest.approx([0, 0, -0.1])
+    assert np.ptp(lying.bounds, axis=0) == approx(np.ptp(upright.bounds, axis=0)[[0, 2, 1]])
+    assert lying.bounds.mean(axis=0) == approx([0, 0, -0.1])
 
 
 RECTANGLE = {"shape": "rectangle", "size": [0.02, 0.02]}
@@ -170,7 +171,7 @@ def test_arm_segment() -> None:
     assert housing.role == "shield"
     radius = 0.048
     for electrode in segment.electrodes:
-        assert electrode.surface.area == pytest.approx(0.022 * 0.038, rel=1e-9)
+        assert electrode.surface.area == approx(0.022 * 0.038, rel=1e-9)
         assert np.abs(distance(vertices(electrode.surface), radius) - radius).max() < 1.2e-4
         shadows = [shapely.Polygon(r[:, :2]).area for f in electrode.surface.facets
                    for r in ring_vertices(f)]  # fmt: skip
@@ -181,4 +182,4 @@ def test_arm_segment() -> None:
     for (i, j), axis in zip(mirrored, (0, 0, 1), strict=True):
         one, other = (segment.electrodes[k].surface.bounds.copy() for k in (i, j))
         one[:, axis] *= -1
-        assert np.sort(one, axis=0) == pytest.approx(np.sort(other, axis=0), abs=1e-12)
+        assert np.sort(one, axis=0) == approx(np.sort(other, axis=0), abs=1e-12)

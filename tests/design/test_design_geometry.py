@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from approximate import approx
 from scipy.spatial.transform import Rotation
 
 from capsense.design.geometry import TOUCH, Facet, Surface, box_facets, enters_box, find_contact
@@ -28,8 +29,8 @@ def test_faces_of_a_box_bound_it() -> None:
     box = Surface(faces, np.empty((0, 2, 3)))
     np.testing.assert_allclose(box.bounds, [LOWER, UPPER], atol=1e-15)
     flux = sum(f.polygon.area * (f.axes[2] @ f.origin) for f in faces)
-    assert flux / 3 == pytest.approx(np.prod(UPPER - LOWER))
-    assert all(np.linalg.det(f.axes) == pytest.approx(1.0) for f in faces)
+    assert flux / 3 == approx(np.prod(UPPER - LOWER))
+    assert all(np.linalg.det(f.axes) == approx(1.0) for f in faces)
 
 
 def test_a_sheet_on_a_face_is_not_inside() -> None:
@@ -55,7 +56,7 @@ def test_a_corner_touches_a_sheet_within_the_tolerance(side: float, over: bool, 
     turn = Rotation.from_euler("xy", [90.0, 45.0], degrees=True)
     mark = sheet((0.001, 0.002, height), turn, (0.01, 0.01))
     lowest = mark.to_sensor(np.asarray(mark.polygon.exterior.coords)[:-1])
-    assert (side * lowest[:, 2]).min() == pytest.approx(gap * TOUCH, abs=1e-12)
+    assert (side * lowest[:, 2]).min() == approx(gap * TOUCH, abs=1e-12)
     one, other = (Surface((f,), np.empty((0, 2, 3))) for f in (plate, mark))
     for pair in ((one, other), (other, one)):
         point = find_contact(*pair)
@@ -101,6 +102,6 @@ def test_what_a_layer_contains() -> None:
 def test_the_ground_of_an_open_domain_is_far_below() -> None:
     """Invariant: it goes with the size, many sizes down; of a closed one it is the box's floor."""
     low, wide = (Domain((s, 0.2 * s, 0.1 * s), 0.01, open=True).floor for s in (0.1, 0.5))
-    assert wide == pytest.approx(5 * low)
+    assert wide == approx(5 * low)
     assert low < -1000 * 0.1
     assert Domain((0.5, 0.5, 0.5), 0.01).floor == -0.01

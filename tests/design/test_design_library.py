@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+from approximate import approx
 
 from capsense.design import Design, Role, available_designs, load_design
 from capsense.design.geometry import Facet
@@ -73,35 +74,35 @@ def test_six_patch() -> None:
     design = load_design("six_patch")
     assert design.electrode_names == ("E1", "E2", "E3", "E4", "E5", "E6")
     want = [[x, y, 0.0] for y in (-25, 25) for x in (-38, 0, 38)]
-    assert centers(design) == pytest.approx(np.array(want))
-    assert extents(design) == pytest.approx(np.tile([30, 30, 0], (6, 1)))
+    assert centers(design) == approx(np.array(want))
+    assert extents(design) == approx(np.tile([30, 30, 0], (6, 1)))
     (plate,) = design.layers
     assert (plate.material, plate.eps_r) == ("polycarbonate", 2.9)
-    assert plate.lower * 1e3 == pytest.approx([-57.5, -42.5, -1.0])
-    assert plate.upper * 1e3 == pytest.approx([57.5, 42.5, 0.0])
+    assert plate.lower * 1e3 == approx([-57.5, -42.5, -1.0])
+    assert plate.upper * 1e3 == approx([57.5, 42.5, 0.0])
     assert design.domain.backplane == 0.01
     bare = load_design("six_patch_bare")
     assert not bare.layers
     assert bare.content_hash() != design.content_hash()
-    assert centers(bare) == pytest.approx(centers(design))
+    assert centers(bare) == approx(centers(design))
 
 
 def test_boards() -> None:
     """Stripe, patch and meander: sizes, pitches and grounded copper of the published boards."""
     stripe, patch, meander = (load_design(n) for n in ("stripe", "patch", "meander"))
-    assert extents(stripe) == pytest.approx(np.tile([5.6, 54.6, 0], (4, 1)), abs=1e-6)
-    assert np.diff(centers(stripe)[:, 0]) == pytest.approx([9.8] * 3)
-    assert extents(patch) == pytest.approx(np.tile([15.7, 15.7, 0], (4, 1)))
+    assert extents(stripe) == approx(np.tile([5.6, 54.6, 0], (4, 1)), abs=1e-6)
+    assert np.diff(centers(stripe)[:, 0]) == approx([9.8] * 3)
+    assert extents(patch) == approx(np.tile([15.7, 15.7, 0], (4, 1)))
     assert sorted(set(centers(patch)[:, 0].round(6))) == [-15.0, 15.0]
-    assert np.ptp(centers(patch)[:, 1]) == pytest.approx(25.1)
+    assert np.ptp(centers(patch)[:, 1]) == approx(25.1)
     whole = np.concatenate([e.surface.bounds for e in meander.electrodes]) * 1e3
-    assert np.ptp(whole, axis=0) == pytest.approx([41.5, 41.0, 0], abs=0.3)
+    assert np.ptp(whole, axis=0) == approx([41.5, 41.0, 0], abs=0.3)
     for design, width in ((stripe, 65), (patch, 65), (meander, 63.5)):
         pour, back = design.conductors
         assert (pour.role, back.role) == (Role.GROUND, Role.GROUND)
-        assert np.ptp(pour.surface.bounds, axis=0) * 1e3 == pytest.approx([width, 77, 0])
-        assert back.surface.bounds[:, 2] == pytest.approx([-0.0016, -0.0016])
-        assert back.surface.area == pytest.approx(width * 77e-6)
+        assert np.ptp(pour.surface.bounds, axis=0) * 1e3 == approx([width, 77, 0])
+        assert back.surface.bounds[:, 2] == approx([-0.0016, -0.0016])
+        assert back.surface.area == approx(width * 77e-6)
         (board,) = design.layers
         assert board.eps_r == 4.5
 
@@ -113,21 +114,21 @@ def test_gap_to_the_pour(name: str, gap: float) -> None:
     pieces = [f.polygon for f in design.conductors[0].surface.facets]
     for electrode in design.electrodes:
         near = min(p.distance(electrode.surface.facets[0].polygon) for p in pieces)
-        assert near * 1e3 == pytest.approx(gap, abs=1e-4)
+        assert near * 1e3 == approx(gap, abs=1e-4)
 
 
 def test_meander_gap() -> None:
     """The two combs interleave with 0.35 mm everywhere."""
     a, b = (e.surface.facets[0].polygon for e in load_design("meander").electrodes)
-    assert a.distance(b) * 1e3 == pytest.approx(0.35, abs=1e-6)
+    assert a.distance(b) * 1e3 == approx(0.35, abs=1e-6)
 
 
 def test_three_stripes() -> None:
     """Three 100 × 20 mm stripes at 30 mm pitch, 2.5 mm above the floor."""
     design = load_design("three_stripes")
     assert design.domain.backplane == 0.0025
-    assert extents(design) == pytest.approx(np.tile([100, 20, 0], (3, 1)))
-    assert centers(design)[:, 1] == pytest.approx([-30, 0, 30])
+    assert extents(design) == approx(np.tile([100, 20, 0], (3, 1)))
+    assert centers(design)[:, 1] == approx([-30, 0, 30])
 
 
 def test_hash_and_imports_in_a_fresh_process() -> None:

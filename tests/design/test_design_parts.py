@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 import capsense as cs
 from capsense import codec
@@ -85,7 +86,7 @@ def test_faces_look_outwards_whatever_the_file_says(folder):
     for name, volume in (("ball", 1.0), ("shell", 1.0 - 0.8**3)):
         part = design(folder, {**BALL, "file": f"{name}.stl"}, pad={"z": 0.03}).layers[0]
         flux = sum(f.polygon.area * (f.axes[2] @ f.origin) for f in part.facets)
-        assert flux == pytest.approx(4 * np.pi * 1e-6 * volume, rel=0.05)
+        assert flux == approx(4 * np.pi * 1e-6 * volume, rel=0.05)
 
 
 def test_thickness(folder):
@@ -93,9 +94,9 @@ def test_thickness(folder):
         folder, {**BOX, "center": [0, 0, 0.05], "quaternion": TURN},
         {**DISC, "center": [0, 0, 0.1]}, {**BALL, "file": "shell.stl", "center": [0, 0, 0.15]},
     ).layers  # fmt: skip
-    assert thickness(parts[0].facets) == pytest.approx(0.002, rel=1e-9)
-    assert thickness(parts[1].facets) == pytest.approx(0.003, rel=1e-9)
-    assert thickness(parts[2].facets) == pytest.approx(0.002, rel=0.1)
+    assert thickness(parts[0].facets) == approx(0.002, rel=1e-9)
+    assert thickness(parts[1].facets) == approx(0.003, rel=1e-9)
+    assert thickness(parts[2].facets) == approx(0.002, rel=0.1)
 
 
 @pytest.mark.parametrize("angle", range(2, 30))
@@ -103,13 +104,13 @@ def test_thickness_of_tilted_boxes(folder, angle):
     """Regression: rays from the middle of a face met the edge between two triangles, and missed."""
     tilted = {"shape": "box", "size": [0.03, 0.02, 0.004], "tilt": [angle, 0, 0]}
     (part,) = design(folder, {**tilted, "center": [0, 0, 0.1]}).layers
-    assert thickness(part.facets) == pytest.approx(0.004, rel=1e-9)
+    assert thickness(part.facets) == approx(0.004, rel=1e-9)
 
 
 def test_turned_box_has_its_corners_there():
     box = design(None, {**BOX, "center": [0.01, 0.02, 0.05], "tilt": [90, 0, 0]}).layers[0]
-    assert box.lower == pytest.approx([-0.01, 0.019, 0.035])
-    assert box.upper == pytest.approx([0.03, 0.021, 0.065])
+    assert box.lower == approx([-0.01, 0.019, 0.035])
+    assert box.upper == approx([0.03, 0.021, 0.065])
 
 
 @pytest.mark.parametrize(
@@ -183,7 +184,7 @@ def test_a_rod_through_a_sheet_away_from_its_edges():
     assert place is not None
     assert (low[:2] < place[:2]).all()
     assert (place[:2] < high[:2]).all()
-    assert place[2] == pytest.approx(0.0, abs=1e-9)
+    assert place[2] == approx(0.0, abs=1e-9)
 
 
 def test_a_sheet_that_touches_an_edge_is_on_one_side():
@@ -223,7 +224,7 @@ def test_it_is_printed_and_drawn(folder):
 
 def test_bend_keeps_parts_in_place():
     bent = design(None, {**DISC, "radius": 0.02, "z": -0.026}, bend={"radius": 0.048})
-    assert bent.layers[0].upper[2] == pytest.approx(-0.0245)
+    assert bent.layers[0].upper[2] == approx(-0.0245)
     with pytest.raises(cs.DesignError, match="flat layers cannot be bent"):
         design(None, {"size": [0.1, 0.1], "z": [-0.002, -0.001]}, bend={"radius": 0.048})
 
@@ -241,4 +242,4 @@ def test_lines_are_cut_where_they_meet_a_surface():
     found = cut_lines(line[None], box)[:, 2]
     for height in (0.094, 0.0965, 0.1, 0.1075, 0.114):
         assert np.abs(found - height).min() < 1e-9
-    assert np.sort(cut_lines(beside[None], box)[:, 2]) == pytest.approx([0.094, 0.104, 0.114])
+    assert np.sort(cut_lines(beside[None], box)[:, 2]) == approx([0.094, 0.104, 0.114])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -73,25 +74,25 @@ def test_straight_shapes(
 ) -> None:
     """Area, extent and number of rims of shapes with straight edges (analytic)."""
     got = surface(shape, **keys)
-    assert got.area * 1e6 == pytest.approx(area, rel=1e-9)
-    assert np.ptp(got.bounds, axis=0) * 1e3 == pytest.approx([*extent, 0.0], abs=1e-9)
+    assert got.area * 1e6 == approx(area, rel=1e-9)
+    assert np.ptp(got.bounds, axis=0) * 1e3 == approx([*extent, 0.0], abs=1e-9)
     assert (len(got.facets), len(got.rims)) == (facets, rims)
 
 
 def test_round_shapes() -> None:
     """Areas of discs and rings are exact, round ends and corners within their chords (analytic)."""
-    assert surface("disc", radius=0.02).area == pytest.approx(math.pi * 4e-4, rel=1e-12)
+    assert surface("disc", radius=0.02).area == approx(math.pi * 4e-4, rel=1e-12)
     ring = surface("ring", inner_radius=0.01, outer_radius=0.02)
-    assert ring.area == pytest.approx(math.pi * 3e-4, rel=1e-12)
+    assert ring.area == approx(math.pi * 3e-4, rel=1e-12)
     slot = surface("stripes", count=1, size=[0.0056, 0.0546], rounded=True)
-    assert slot.area == pytest.approx(0.0056 * 0.049 + math.pi * 0.0028**2, rel=5e-4)
-    assert np.ptp(slot.bounds, axis=0)[:2] == pytest.approx([0.0056, 0.0546], abs=1e-9)
+    assert slot.area == approx(0.0056 * 0.049 + math.pi * 0.0028**2, rel=5e-4)
+    assert np.ptp(slot.bounds, axis=0)[:2] == approx([0.0056, 0.0546], abs=1e-9)
     tile = surface("rectangle", size=[0.03, 0.02], corner_radius=0.005)
-    assert tile.area == pytest.approx(6e-4 - (4 - math.pi) * 25e-6, rel=5e-4)
+    assert tile.area == approx(6e-4 - (4 - math.pi) * 25e-6, rel=5e-4)
     coin = surface("rectangle", size=[0.02, 0.02], corner_radius=0.01)
-    assert coin.area == pytest.approx(math.pi * 1e-4, rel=1e-9)
+    assert coin.area == approx(math.pi * 1e-4, rel=1e-9)
     pill = surface("rectangle", size=[0.03, 0.02], corner_radius=0.01)
-    assert pill.area == pytest.approx(2e-4 + math.pi * 1e-4, rel=3e-3)
+    assert pill.area == approx(2e-4 + math.pi * 1e-4, rel=3e-3)
 
 
 @pytest.mark.parametrize("radius", [1e-6, 1e-4, 2.8e-3, 0.02, 0.2])
@@ -156,17 +157,17 @@ def test_combs_interleave() -> None:
 def test_box_is_closed() -> None:
     """A box has six facets, twelve rims, outward normals and its own volume (analytic)."""
     box = surface("box", size=[0.02, 0.03, 0.04], center=[0.01, 0.02, 0.05], rotation=90)
-    assert box.area == pytest.approx(2 * (6e-4 + 8e-4 + 12e-4), rel=1e-12)
+    assert box.area == approx(2 * (6e-4 + 8e-4 + 12e-4), rel=1e-12)
     ends = {tuple(np.round(p, 9)) for p in box.rims.reshape(-1, 3)}
     assert ends == {(x, y, z) for x in (-0.005, 0.025) for y in (0.01, 0.03) for z in (0.03, 0.07)}
     lengths = np.linalg.norm(box.rims[:, 0] - box.rims[:, 1], axis=1)
-    assert sorted(lengths) == pytest.approx(4 * [0.02] + 4 * [0.03] + 4 * [0.04])
-    assert box.bounds == pytest.approx(np.array([[-0.005, 0.01, 0.03], [0.025, 0.03, 0.07]]))
+    assert sorted(lengths) == approx(4 * [0.02] + 4 * [0.03] + 4 * [0.04])
+    assert box.bounds == approx(np.array([[-0.005, 0.01, 0.03], [0.025, 0.03, 0.07]]))
     volume = 0.0
     for facet in box.facets:
-        assert np.linalg.det(facet.axes) == pytest.approx(1.0)
+        assert np.linalg.det(facet.axes) == approx(1.0)
         volume += facet.polygon.area * float(facet.origin @ facet.axes[2]) / 3
-    assert volume == pytest.approx(0.02 * 0.03 * 0.04, rel=1e-12)
+    assert volume == approx(0.02 * 0.03 * 0.04, rel=1e-12)
 
 
 @pytest.mark.parametrize("rotation", [90, -270])
@@ -188,7 +189,7 @@ def test_tilt_and_quaternion_agree() -> None:
         turn[axis], turn[3] = math.sin(angle), math.cos(angle)
         quaternion = _times(turn, quaternion)
     turned = surface("polygon", quaternion=quaternion.tolist(), **keys)
-    assert tilted.rims == pytest.approx(turned.rims, abs=1e-12)
+    assert tilted.rims == approx(turned.rims, abs=1e-12)
     c, s = np.cos(np.radians([30, 40, 50])), np.sin(np.radians([30, 40, 50]))
     x_axis = np.array([c[1] * c[2], c[1] * s[2], -s[1]])
     corner = ring_vertices(tilted.facets[0])[0]
@@ -207,7 +208,7 @@ def test_horizontal_sheets_hold_sensor_coordinates() -> None:
         facet = surface("rectangle", size=[0.03, 0.02], center=[0.04, 0.05, 0.06], **turn).facets[0]
         assert facet.axes.tolist() == np.eye(3).tolist()
         assert facet.origin.tolist() == [0.0, 0.0, 0.06]
-        assert facet.polygon.centroid.coords[0] == pytest.approx((0.04, 0.05))
+        assert facet.polygon.centroid.coords[0] == approx((0.04, 0.05))
 
 
 def test_triangles_cover_the_surface() -> None:
@@ -215,15 +216,15 @@ def test_triangles_cover_the_surface() -> None:
     got = surface("comb", **COMB, tilt=[10, 20, 0])
     a, b, c = np.moveaxis(got.triangles, 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-    assert area == pytest.approx(got.area, rel=1e-9)
+    assert area == approx(got.area, rel=1e-9)
 
 
 def test_leads_join_the_electrode() -> None:
     """A lead adds its area outside the patch and turns with it."""
     keys = {"size": [0.01, 0.01], "leads": [{"points": [[0, 0], [0, -0.02]], "width": 0.001}]}
     got = surface("rectangle", **keys, rotation=90)
-    assert got.area == pytest.approx(1e-4 + 0.015 * 0.001, rel=1e-9)
-    assert got.bounds[1, 0] == pytest.approx(0.02)
+    assert got.area == approx(1e-4 + 0.015 * 0.001, rel=1e-9)
+    assert got.bounds[1, 0] == approx(0.02)
 
 
 POUR = {"name": "pour", "role": "ground", "shape": "rectangle", "size": [0.1, 0.1]}
@@ -238,7 +239,7 @@ def test_clearance_is_cut_around_electrodes_and_leads() -> None:
     }
     got = design(patch, conductor=[{**POUR, "clearance": 0.0005}]).conductors[0].surface
     want = 0.1**2 - 0.011**2 - (0.05 - 0.0055) * 0.002
-    assert got.area == pytest.approx(want, rel=1e-8)
+    assert got.area == approx(want, rel=1e-8)
     assert len(got.facets) == 1
 
 
@@ -266,14 +267,14 @@ def test_clearance_keeps_its_distance_in_a_tilted_plane() -> None:
     patch = {"shape": "rectangle", "size": [0.02, 0.02], **pose}
     pour = {**POUR, **pose, "clearance": 0.002}
     got = design(patch, conductor=[pour]).conductors[0].surface
-    assert got.area == pytest.approx(0.1**2 - 0.024**2, rel=1e-6)
+    assert got.area == approx(0.1**2 - 0.024**2, rel=1e-6)
 
 
 def test_pour_in_another_plane_keeps_its_outline() -> None:
     """Clearance concerns one plane only."""
     patch = {"shape": "rectangle", "size": [0.01, 0.01]}
     got = design(patch, conductor=[{**POUR, "z": -0.001, "clearance": 0.001}]).conductors[0].surface
-    assert got.area == pytest.approx(0.01, rel=1e-12)
+    assert got.area == approx(0.01, rel=1e-12)
 
 
 def test_hash_sees_geometry_and_materials_only() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.design import Design, load_design, parse_design
 from capsense.design.stl import read_stl
@@ -65,7 +66,7 @@ def test_flat_sheet_is_the_same_as_a_rectangle(tmp_path: Path, kind: str) -> Non
     assert (len(surface.facets), len(surface.rims)) == (1, 4)
     item = {"name": "R", "shape": "rectangle", "size": [0.03, 0.02], "center": [0.01, 0.02, 0.03]}
     same = parse_design({"name": "t", "domain": DOMAIN, "electrode": [item]})
-    assert surface.rims.mean(axis=(0, 1)) == pytest.approx([0.01, 0.02, 0.03])
+    assert surface.rims.mean(axis=(0, 1)) == approx([0.01, 0.02, 0.03])
     assert design.content_hash() == same.content_hash()
 
 
@@ -76,7 +77,7 @@ def test_tilted_flat_sheet_is_one_facet(tmp_path: Path) -> None:
     save(tmp_path, points @ turn.T, faces)
     surface = stl(tmp_path, z=0.15).electrodes[0].surface
     assert (len(surface.facets), len(surface.rims)) == (1, 4)
-    assert surface.area == pytest.approx(0.06, rel=1e-6)
+    assert surface.area == approx(0.06, rel=1e-6)
 
 
 def test_sheet_with_hole(tmp_path: Path) -> None:
@@ -88,7 +89,7 @@ def test_sheet_with_hole(tmp_path: Path) -> None:
     (facet,) = surface.facets
     assert len(facet.polygon.interiors) == 1
     assert len(surface.rims) == 8
-    assert surface.area == pytest.approx(800e-6)
+    assert surface.area == approx(800e-6)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +100,7 @@ def test_units_and_scale(tmp_path: Path, unit: str, scale: float, metres: float)
     """Sizes are those of the file times unit and scale."""
     save(tmp_path, *flat((3.0, 2.0)))
     surface = stl(tmp_path, unit=unit, scale=scale).electrodes[0].surface
-    assert np.ptp(surface.bounds, axis=0) == pytest.approx([3 * metres, 2 * metres, 0])
+    assert np.ptp(surface.bounds, axis=0) == approx([3 * metres, 2 * metres, 0])
 
 
 def test_curved_patch_keeps_facets_and_has_boundary_rims_only(tmp_path: Path) -> None:
@@ -108,10 +109,10 @@ def test_curved_patch_keeps_facets_and_has_boundary_rims_only(tmp_path: Path) ->
     surface = stl(tmp_path, z=0.1, tilt=[0, 0, 30]).electrodes[0].surface
     assert len(surface.facets) == 12
     chord = 2 * 40 * math.sin(math.radians(90 / 12 / 2))
-    assert surface.area == pytest.approx(12 * chord * 50e-6, rel=1e-6)
+    assert surface.area == approx(12 * chord * 50e-6, rel=1e-6)
     assert len(surface.rims) == 2 * 12 + 2
     lengths = np.linalg.norm(surface.rims[:, 1] - surface.rims[:, 0], axis=1)
-    assert lengths.sum() == pytest.approx((24 * chord + 100) * 1e-3, rel=1e-6)
+    assert lengths.sum() == approx((24 * chord + 100) * 1e-3, rel=1e-6)
 
 
 def test_creases_are_rims(tmp_path: Path) -> None:
@@ -142,12 +143,12 @@ def test_closed_shells(tmp_path: Path) -> None:
     save(tmp_path, box.vertices, box.faces)
     block = stl(tmp_path, z=0.1, closed=True).electrodes[0].surface
     assert (len(block.facets), len(block.rims)) == (6, 12)
-    assert block.area == pytest.approx(2 * (600 + 800 + 1200) * 1e-6)
+    assert block.area == approx(2 * (600 + 800 + 1200) * 1e-6)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=20)
     save(tmp_path, ball.vertices, ball.faces)
     sphere = stl(tmp_path, z=0.1).electrodes[0].surface
     assert len(sphere.rims) == 0
-    assert sphere.area == pytest.approx(4 * math.pi * 4e-4, rel=0.02)
+    assert sphere.area == approx(4 * math.pi * 4e-4, rel=0.02)
     assert len(sphere.facets) == len(ball.faces)
 
 
@@ -156,7 +157,7 @@ def test_own_reader_agrees_with_trimesh() -> None:
     for name in ("stripe_geom.stl", "zack_electrodes.stl"):
         path = PUBLISHED / name
         want = trimesh.load_mesh(path, process=False).triangles
-        assert read_stl(path) == pytest.approx(want)
+        assert read_stl(path) == approx(want)
 
 
 def imprint(file: str, **keys: Any) -> dict[str, Any]:
@@ -175,8 +176,8 @@ def test_published_stripes() -> None:
         assert (len(surface.facets), len(surface.rims)) == (1, 4)
         low, high = surface.bounds * 1e3
         x = -15 + 10 * k
-        assert low == pytest.approx([x - 2.5, -22.5, 0.0], abs=1e-6)
-        assert high == pytest.approx([x + 2.5, 27.5, 0.0], abs=1e-6)
+        assert low == approx([x - 2.5, -22.5, 0.0], abs=1e-6)
+        assert high == approx([x + 2.5, 27.5, 0.0], abs=1e-6)
 
 
 def test_published_six_electrodes() -> None:
@@ -206,7 +207,7 @@ def test_stl_path_is_relative_to_the_design_file(tmp_path: Path) -> None:
         'name = "d"\n[domain]\nsize = [0.5, 0.5, 0.5]\nbackplane = 0.01\n'
         '[[electrode]]\nname = "E"\nshape = "stl"\nfile = "part.stl"\nunit = "mm"\n'
     )
-    assert load_design(tmp_path / "d.toml").electrodes[0].surface.area == pytest.approx(6e-4)
+    assert load_design(tmp_path / "d.toml").electrodes[0].surface.area == approx(6e-4)
 
 
 def refused(call: Any, *parts: str) -> None:

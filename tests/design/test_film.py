@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.design import load_design, parse_design
 from capsense.design.film import Film, strip_plane, strips
@@ -59,7 +60,7 @@ def test_strips_cover_the_arc_and_are_as_wide(height):
         ends = origin + np.array([[-half], [half]]) * axes[0]
         at = FILM.coordinates(ends)
         np.testing.assert_allclose(at[:, 0], [strip.start, strip.end], atol=1e-15)
-        assert np.linalg.det(axes) == pytest.approx(1.0)
+        assert np.linalg.det(axes) == approx(1.0)
 
 
 def test_a_design_keeps_its_film():
@@ -71,7 +72,7 @@ def test_a_design_keeps_its_film():
     )
     small = design.in_units
     assert small.film is not None
-    assert small.film.radius == pytest.approx(0.05 / design.unit)
+    assert small.film.radius == approx(0.05 / design.unit)
 
 
 def test_the_bend_counts_for_the_hash():

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from approximate import approx
 from tiny_field import SETTINGS, arrays, digest, few_sources, tiny_design
 
 from capsense.field import background
@@ -57,9 +58,9 @@ def test_refined_settings(factor: float) -> None:
     plain = MeshSettings()
     for settings in (plain.refined(factor), BuildSettings().refined(factor).mesh):
         for name in ("edge", "growth", "far", "face", "growth_z", "far_z", "tall"):
-            assert getattr(settings, name) == pytest.approx(getattr(plain, name) / factor)
-        assert settings.merge == pytest.approx(plain.merge / max(factor, 1.0))
-    assert BuildSettings(3.0).refined(factor).panel_scale == pytest.approx(3.0 / factor)
+            assert getattr(settings, name) == approx(getattr(plain, name) / factor)
+        assert settings.merge == approx(plain.merge / max(factor, 1.0))
+    assert BuildSettings(3.0).refined(factor).panel_scale == approx(3.0 / factor)
     assert plain.merge < plain.edge < 0.01 < plain.far
     assert 0.0 < plain.growth < 1.0
     assert 0.0 < plain.growth_z < 1.0

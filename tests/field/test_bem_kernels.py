@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from approximate import approx
 from field_cases import sheet
 from scipy.integrate import dblquad
 from scipy.spatial.transform import Rotation
@@ -42,7 +43,7 @@ def test_square_on_its_axis(z):
     angle = math.atan2(s * s, h * math.sqrt(2 * s * s + h * h))
     expected = 4 * (2 * s * math.asinh(s / math.sqrt(s * s + h * h)) - h * angle)
     got = kernels.polygon_potential(square(a), UP, 0.0, 0.0, z)
-    assert got == pytest.approx(expected, rel=1e-9)
+    assert got == approx(expected, rel=1e-9)
     if z:
         slope = -4 * math.copysign(angle, z)
         np.testing.assert_allclose(gradient(square(a), 0.0, 0.0, z), [0, 0, slope], atol=1e-9)
@@ -57,10 +58,10 @@ def test_disc_on_its_axis():
     for z in (0.0, 0.001, 0.02, 0.1):
         expected = 2 * math.pi * (math.hypot(radius, z) - z)
         got = kernels.polygon_potential(edges, UP, 0.0, 0.0, z)
-        assert got == pytest.approx(expected, rel=2e-5)
+        assert got == approx(expected, rel=2e-5)
         if z:
             slope = 2 * math.pi * (z / math.hypot(radius, z) - 1)
-            assert gradient(edges, 0.0, 0.0, z)[2] == pytest.approx(slope, rel=1e-4)
+            assert gradient(edges, 0.0, 0.0, z)[2] == approx(slope, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -85,7 +86,7 @@ def test_triangle_by_numerical_quadrature(seed):
 
     edges = loop([tuple(c) for c in corners])
     expected = integrand(1, lambda d: 1.0)
-    assert kernels.polygon_potential(edges, UP, x, y, z) == pytest.approx(expected, rel=1e-7)
+    assert kernels.polygon_potential(edges, UP, x, y, z) == approx(expected, rel=1e-7)
     slopes = [integrand(3, lambda d, k=k: -d[k]) for k in range(3)]
     np.testing.assert_allclose(gradient(edges, x, y, z), slopes, rtol=1e-6, atol=1e-9)
 
@@ -107,11 +108,11 @@ def test_polygons_turned_and_moved_with_their_points(turn):
     for point in ((0.012, 0.006, 0.004), (0.05, -0.01, -0.02), (-0.01, 0.03, 0.0)):
         moved, out = turn @ point + shift, np.empty(3)
         expected = kernels.polygon_potential(flat, UP, *point)
-        assert kernels.polygon_potential(edges, normal, *moved) == pytest.approx(expected, rel=1e-9)
+        assert kernels.polygon_potential(edges, normal, *moved) == approx(expected, rel=1e-9)
         kernels.polygon_gradient(edges, normal, *moved, out)
         np.testing.assert_allclose(out, turn @ gradient(flat, *point), rtol=0, atol=1e-9)
         angles = kernels.solid_angle(edges, normal, *moved), kernels.solid_angle(flat, UP, *point)
-        assert angles[0] == pytest.approx(angles[1], abs=1e-9)
+        assert angles[0] == approx(angles[1], abs=1e-9)
 
 
 def test_holes_subtract():
@@ -122,7 +123,7 @@ def test_holes_subtract():
         whole = kernels.polygon_potential(square(0.04), UP, *point)
         inner = kernels.polygon_potential(square(0.01), UP, *point)
         got = kernels.polygon_potential(frame, UP, *point)
-        assert got == pytest.approx(whole - inner, rel=1e-10)
+        assert got == approx(whole - inner, rel=1e-10)
 
 
 def test_potential_is_continuous_and_its_normal_slope_jumps_by_4_pi():
@@ -130,10 +131,10 @@ def test_potential_is_continuous_and_its_normal_slope_jumps_by_4_pi():
     edges = loop([(0.0, 0.0), (0.03, 0.0), (0.025, 0.02), (0.0, 0.01)])
     x, y = 0.012, 0.006
     above, on, below = (kernels.polygon_potential(edges, UP, x, y, z) for z in (1e-9, 0.0, -1e-9))
-    assert above == pytest.approx(on, rel=1e-6)
-    assert below == pytest.approx(on, rel=1e-6)
+    assert above == approx(on, rel=1e-6)
+    assert below == approx(on, rel=1e-6)
     jump = gradient(edges, x, y, 1e-7)[2] - gradient(edges, x, y, -1e-7)[2]
-    assert jump == pytest.approx(-4 * math.pi, rel=1e-4)
+    assert jump == approx(-4 * math.pi, rel=1e-4)
     assert gradient(edges, x, y, 0.0)[2] == 0.0
     outside = gradient(edges, 0.1, 0.1, 1e-9)
     assert abs(outside[2]) < 1e-6
@@ -146,7 +147,7 @@ def test_points_on_edges_and_corners_are_finite(point):
     got = kernels.polygon_potential(edges, UP, *point, 0.0)
     near = kernels.polygon_potential(edges, UP, point[0] - 1e-9, point[1] - 2e-9, 0.0)
     assert np.isfinite(got)
-    assert got == pytest.approx(near, rel=1e-5)
+    assert got == approx(near, rel=1e-5)
     assert np.isfinite(gradient(edges, *point, 0.0)).all()
 
 
@@ -261,7 +262,7 @@ def test_rows_of_conductors_against_slow_means(panels):
             if np.linalg.norm(apart) >= reach and not (low and np.hypot(*apart[:2]) < reach):
                 points, weights, far = panels.centers[[i]], np.ones(1), far + 1
             expected = np.average([slow_potential(panels, j, r) for r in points], weights=weights)
-            assert matrix[i, j] == pytest.approx(expected, rel=1e-9, abs=1e-16)
+            assert matrix[i, j] == approx(expected, rel=1e-9, abs=1e-16)
     assert 0.1 < far / n**2 < 0.9
 
 
@@ -276,7 +277,7 @@ def test_rows_of_interfaces_against_slow_means(panels):
             expected = slow_slope(panels, i, j, True)
             if i != j:
                 expected += slow_slope(panels, i, j, False)
-            assert slopes[i, j] == pytest.approx(expected, rel=1e-8, abs=1e-12)
+            assert slopes[i, j] == approx(expected, rel=1e-8, abs=1e-12)
     np.testing.assert_allclose(matrix, 2 * np.pi * np.eye(n) - contrast[:, None] * slopes)
 
 
@@ -292,7 +293,7 @@ def test_solid_angles_and_rows_of_parts(panels):
         kernels.polygon_gradient(edges, normal, *r, out)
         off = abs(normal @ (r - edges[0, 0]))
         found = kernels.solid_angle(edges, normal, *r)
-        assert found == pytest.approx(-normal @ out if off > 1e-12 else 0.0, abs=1e-9)
+        assert found == approx(-normal @ out if off > 1e-12 else 0.0, abs=1e-9)
         return found
 
     for i in range(n):
@@ -302,7 +303,7 @@ def test_solid_angles_and_rows_of_parts(panels):
             for w, r in zip(panels.weights[j][used], panels.quad[j][used], strict=True):
                 total += w * ((angle(i, r) if i != j else 0.0) - angle(i, mirrored(r)))
             expected = 2 * np.pi * (i == j) - contrast[i] * total / panels.areas[i]
-            assert matrix[i, j] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+            assert matrix[i, j] == approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_fluxes_of_point_charges(panels):
@@ -313,4 +314,4 @@ def test_fluxes_of_point_charges(panels):
     for k, r in enumerate(points):
         for m, j in enumerate(rows):
             ways = slow_gradient(panels, j, r) - slow_gradient(panels, j, mirrored(r))
-            assert found[k, m] == pytest.approx(-panels.normals[j] @ ways, rel=1e-9, abs=1e-13)
+            assert found[k, m] == approx(-panels.normals[j] @ ways, rel=1e-9, abs=1e-13)

@@ -8,6 +8,7 @@ import multiprocessing
 import numpy as np
 import pytest
 import shapely
+from approximate import approx
 from field_cases import (
     PICO,
     assert_physical,
@@ -57,7 +58,7 @@ def test_unit_square_plate(scale):
     free = figures()["unit_square_plate"]["C_over_4pi_eps0_a"] * 4 * math.pi * EPS0 * a
     expected = 1 / (1 / free - NACL / (4 * math.pi * EPS0 * box))
     got = capacitance(patches(rectangle((0, 0), (a, a))), scale)[0, 0]
-    assert got == pytest.approx(expected, rel=2e-3 * scale)
+    assert got == approx(expected, rel=2e-3 * scale)
 
 
 ITSELF = pytest.param(1.0, marks=pytest.mark.e2e)
@@ -95,7 +96,7 @@ def test_disc_in_a_large_box(box):
     )
     free = 2 * radius / math.pi  # over 4π eps0
     wanted = 4 * math.pi * EPS0 * free / (1 - 1.7476 * free / box)
-    assert capacitance(design)[0, 0] == pytest.approx(wanted, rel=2e-3)
+    assert capacitance(design)[0, 0] == approx(wanted, rel=2e-3)
     assert 2500 < build_model(design).panels.size < 3500
 
 
@@ -136,7 +137,7 @@ def test_pads_on_a_board(centers, side, strip, board, wanted):
         ]
     found = capacitance(parse_design(data)) / (1e-3 * PICO)
     for at, value in wanted.items():
-        assert found[at] == pytest.approx(value, rel=0.012)
+        assert found[at] == approx(value, rel=0.012)
 
 
 def test_large_array_is_cut_to_what_fits():
@@ -163,8 +164,8 @@ def test_two_stripes(scale):
         shapely.box(0.0025, -0.05, 0.0125, 0.05), shapely.box(-0.0125, -0.05, -0.0025, 0.05)
     )
     got = capacitance(design, scale)
-    assert got[0, 0] == pytest.approx(case["C11"] * PICO, rel=0.005)
-    assert got[0, 1] == pytest.approx(case["C12"] * PICO, rel=0.01)
+    assert got[0, 0] == approx(case["C11"] * PICO, rel=0.005)
+    assert got[0, 1] == approx(case["C12"] * PICO, rel=0.01)
     assert_physical(0.5 * (got + got.T))
 
 
@@ -174,7 +175,7 @@ def test_baseline_of_packaged_designs(simulators, name):
     got, expected = simulators(name).baseline, empty_reference(name)
     np.testing.assert_allclose(np.diag(got), np.diag(expected), rtol=0.015)
     for i, j in ((0, 1), (1, 2), (3, 4), (4, 5), (0, 3), (1, 4), (2, 5)):
-        assert got[i, j] == pytest.approx(expected[i, j], rel=0.03)
+        assert got[i, j] == approx(expected[i, j], rel=0.03)
     largest = np.abs(off_diagonal(expected)).max()
     np.testing.assert_allclose(off_diagonal(got), off_diagonal(expected), atol=0.03 * largest)
     assert_physical(got, 1e-6)
@@ -220,7 +221,7 @@ def test_pads_on_matter_and_in_air_couple_alike():
         layers=(slab(3.0, (-0.04, -0.02, -0.008), (-0.004, 0.02, 0.0)),),
     )  # fmt: skip
     got = capacitance(design, 3.0)
-    assert got[0, 1] == pytest.approx(got[1, 0], rel=0.05)
+    assert got[0, 1] == approx(got[1, 0], rel=0.05)
     assert got[0, 0] > 1.4 * got[1, 1]
     assert_physical(0.5 * (got + got.T))
 

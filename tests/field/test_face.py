@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from approximate import approx
 
 from capsense.design import parse_design
 from capsense.design.shapes import STRIP_ERROR
@@ -56,9 +57,9 @@ def test_areas_of_a_bent_plane_grow_with_its_radius(bent, height):
     plane, solution = bent
     ends = np.array([solution.design.film.sheets[name].bounds[:, :2] for name in "AB"])
     whole = np.prod(ends.max(axis=(0, 1)) - ends.min(axis=(0, 1)) + 2 * REACH)
-    assert plane.panels.areas.sum() == pytest.approx(whole, rel=1e-6)
+    assert plane.panels.areas.sum() == approx(whole, rel=1e-6)
     grown = whole * (1 + height / RADIUS)
-    assert plane.at(height).areas.sum() == pytest.approx(grown, rel=1e-6)
+    assert plane.at(height).areas.sum() == approx(grown, rel=1e-6)
 
 
 def test_a_flat_plane_is_moved_as_it_is():
@@ -81,7 +82,7 @@ def test_no_panel_lies_across_a_rim(radius):
             shapely.contains_xy(reach, *panels.edges[a:b, 0, :2].T).all()
             for a, b in pairwise(panels.first)
         ]
-        assert panels.areas[inside].sum() == pytest.approx(outline.area, rel=1e-6)
+        assert panels.areas[inside].sum() == approx(outline.area, rel=1e-6)
 
 
 def test_the_table_of_a_hardly_bent_film_is_that_of_the_flat_design():

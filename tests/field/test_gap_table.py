@@ -7,7 +7,7 @@ import tomllib
 from functools import cache
 
 import numpy as np
-import pytest
+from approximate import approx
 
 from capsense.constants import EPS0
 from capsense.design import parse_design
@@ -77,7 +77,7 @@ def test_cells_cover_the_electrodes():
     table = _table()
     for terminal in (0, 1):
         some = table.terminal == terminal
-        assert table.areas[some].sum() == pytest.approx(1e-4, rel=1e-5)
+        assert table.areas[some].sum() == approx(1e-4, rel=1e-5)
         center = table.areas[some] @ table.points[some] / table.areas[some].sum()
         np.testing.assert_allclose(center, [-0.006 + 0.012 * terminal, 0.0, 0.0], atol=1e-6)
     starts = table.blocks
@@ -88,17 +88,17 @@ def test_cells_cover_the_electrodes():
 def test_near_contact_it_is_a_plate_capacitor():
     table = _table()
     plate = EPS0 * 1e-4 / table.heights[0]
-    assert _entry(table, 0, 0, 0) == pytest.approx(plate, rel=0.01)
-    assert _entry(table, 0, -1, 0) == pytest.approx(-plate, rel=0.03)
+    assert _entry(table, 0, 0, 0) == approx(plate, rel=0.01)
+    assert _entry(table, 0, -1, 0) == approx(-plate, rel=0.03)
 
 
 def test_a_cover_is_in_series():
     table = _table(PAD + COVER)
-    assert table.top == pytest.approx(0.0006)
+    assert table.top == approx(0.0006)
     some = np.linalg.norm(table.points[:, :2] - [-0.006, 0.0], axis=1) < 3e-3
     np.testing.assert_allclose(table.series[some], 0.0006 / 3.0, rtol=0.1)
     plate = EPS0 * 1e-4 / (table.heights[0] + 0.0006 / 3.0)
-    assert _entry(table, 0, 0, 0) == pytest.approx(plate, rel=0.1)
+    assert _entry(table, 0, 0, 0) == approx(plate, rel=0.1)
 
 
 def test_the_plane_screens_electrodes_from_one_another():
@@ -128,7 +128,7 @@ def test_charges_are_those_of_design_and_plane_solved_anew():
     for i in range(2):
         found = (change[owner == i] * areas[owner == i, None]).sum(axis=0)
         np.testing.assert_allclose(found[:2], (both[:2, :2] - alone)[i], rtol=0.03, atol=2e-15)
-        assert found[2] == pytest.approx(both[i, 2], rel=0.03)
+        assert found[2] == approx(both[i, 2], rel=0.03)
     assert len(change) == n
 
 

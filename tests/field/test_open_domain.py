@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 from tiny_field import few_sources
 
 import capsense as cs
@@ -42,7 +43,7 @@ def boxed(field_cache: Path) -> cs.Simulator:
 def test_disc_alone_has_the_capacitance_of_the_textbook(sim, boxed):
     """8 eps0 a (Jackson, Classical Electrodynamics, section 3.13), of a polygon, by panels."""
     expected = 8 * EPS0 * RADIUS
-    assert sim.baseline[0, 0] == pytest.approx(expected, rel=5e-4)
+    assert sim.baseline[0, 0] == approx(expected, rel=5e-4)
     assert boxed.baseline[0, 0] > 1.01 * expected
 
 
@@ -61,7 +62,7 @@ def test_small_ball_sees_the_potential_of_a_disc(sim, z, b):
     slope = 2 / math.pi * RADIUS / (RADIUS**2 + z**2)
     expected = 4 * math.pi * EPS0 * (b * phi**2 / (1 - own) + b**3 * slope**2)
     found = sim.step(cs.Scene([ball])).delta[0, 0]
-    assert found == pytest.approx(expected, rel=0.02)
+    assert found == approx(expected, rel=0.02)
 
 
 @pytest.mark.e2e

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from approximate import approx
 from field_cases import sheet
 
 from capsense.design.geometry import Facet
@@ -39,7 +40,7 @@ def test_pieces_tile_the_facet(name):
     polygon = shapely.geometry.polygon.orient(SHAPES[name])
     pieces, panels = cut(polygon, Grading(1e-4, largest=0.004))
     assert len(pieces) == panels.size
-    assert sum(p.area for p in pieces) == pytest.approx(polygon.area, rel=1e-6)
+    assert sum(p.area for p in pieces) == approx(polygon.area, rel=1e-6)
     assert shapely.union_all(pieces).symmetric_difference(polygon).area < 1e-6 * polygon.area
     np.testing.assert_allclose(panels.areas, [p.area for p in pieces], rtol=1e-9)
     assert (panels.areas > 0).all()
@@ -57,7 +58,7 @@ def test_centroids_and_diameters(name):
         middle = np.array(piece.centroid.coords[0])
         np.testing.assert_allclose(center, facet.to_sensor(middle), atol=1e-9)
         corners = np.asarray(piece.exterior.coords)
-        assert diameter == pytest.approx(2 * np.linalg.norm(corners - middle, axis=1).max(), 1e-6)
+        assert diameter == approx(2 * np.linalg.norm(corners - middle, axis=1).max(), 1e-6)
 
 
 def test_rims_at_a_micrometre_or_less_lie_in_the_facet():
@@ -85,7 +86,7 @@ def test_quadrature_is_exact_for_quadratics(name):
         corners = np.asarray(triangle.exterior.coords)[:3]
         middles = (corners + np.roll(corners, 1, axis=0)) / 2
         expected += triangle.area * f(*middles.T).mean()
-    assert got == pytest.approx(expected, rel=1e-6)
+    assert got == approx(expected, rel=1e-6)
 
 
 def test_panels_are_finer_towards_rims():
@@ -110,8 +111,8 @@ def test_rims_of_another_sheet_refine_from_an_eighth_of_their_height_on():
     near = cut_facet(facet, rim, Grading(1e-4, largest=0.004), reach=0.003)
     assert len(near) > len(plain)
     widths = [np.ptp(np.array(p.bounds).reshape(2, 2), axis=0).min() for p in near]
-    assert min(widths) == pytest.approx(2e-4, rel=1e-6)  # the first band of at least 0.125 mm
-    assert sum(p.area for p in near) == pytest.approx(polygon.area, rel=1e-6)
+    assert min(widths) == approx(2e-4, rel=1e-6)  # the first band of at least 0.125 mm
+    assert sum(p.area for p in near) == approx(polygon.area, rel=1e-6)
 
 
 def test_a_rim_that_stands_upright_is_not_graded_to():

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from scipy.special import eval_legendre
 
 import capsense as cs
@@ -63,7 +64,7 @@ def test_coated_ball(balls, eps_r):
         balls,
     )
     series = (1 / INNER - 1 / OUTER) / eps_r + 1 / OUTER
-    assert capacitance(solution)[0, 0] == pytest.approx(4 * math.pi * EPS0 / series, rel=1e-3)
+    assert capacitance(solution)[0, 0] == approx(4 * math.pi * EPS0 / series, rel=1e-3)
 
 
 def test_charge_beside_a_dielectric_ball(balls):
@@ -87,7 +88,7 @@ def test_charge_beside_a_dielectric_ball(balls):
     n = np.arange(200)[:, None]
     terms = n * (eps_r - 1) / (n * (eps_r + 1) + 1) * np.exp((2 * n + 1) * np.log(OUTER / d)) / d
     wanted = -(terms * eval_legendre(n, points[:, 2] / d)).sum(axis=0)
-    assert found == pytest.approx(wanted, abs=0.02 * abs(wanted).max())
+    assert found == approx(wanted, abs=0.02 * abs(wanted).max())
 
 
 def pads_on_box(quaternion: tuple[float, ...], slab: bool = False) -> dict[str, Any]:
@@ -117,8 +118,8 @@ def test_turned_box_reads_as_the_upright_one():
     upright, turned, slab = (
         capacitance(solved(pads_on_box(*args))) for args in ((UPRIGHT,), (TURNED,), (UPRIGHT, True))
     )
-    assert turned == pytest.approx(upright, rel=1e-5)
-    assert slab == pytest.approx(upright, rel=0.01)
+    assert turned == approx(upright, rel=1e-5)
+    assert slab == approx(upright, rel=0.01)
 
 
 def test_faces_under_pads_are_no_interfaces():
@@ -127,9 +128,9 @@ def test_faces_under_pads_are_no_interfaces():
         data = {"name": "part", "domain": OPEN, **pads_on_box(turn)}
         model = build_model(parse_design(data), Accuracy(2.0, fitted=False))
         bare = model.panels.areas[model.owner == INTERFACE].sum()
-        assert bare == pytest.approx(2 * (0.05 * 0.03 + 0.003 * 0.08) - 2 * 0.02**2, rel=1e-6)
+        assert bare == approx(2 * (0.05 * 0.03 + 0.003 * 0.08) - 2 * 0.02**2, rel=1e-6)
         below = model.owner >= 0
-        assert model.eps_front[below] + model.eps_back[below] == pytest.approx(5.0)
+        assert model.eps_front[below] + model.eps_back[below] == approx(5.0)
 
 
 def test_stacked_parts_share_one_face():
@@ -145,7 +146,7 @@ def test_stacked_parts_share_one_face():
     model = build_model(parse_design({"name": "p", "domain": OPEN, **data}), Accuracy(2.0, False))
     areas = model.panels.areas
     both = model.eps_front + model.eps_back
-    assert areas[np.isclose(both, 6.0)].sum() == pytest.approx(math.pi * 1e-4, rel=6e-3)
+    assert areas[np.isclose(both, 6.0)].sum() == approx(math.pi * 1e-4, rel=6e-3)
     assert set(np.unique(both[model.owner == INTERFACE])) == {3.0, 5.0, 6.0}
 
 
@@ -180,4 +181,4 @@ def test_a_body_over_a_cover_that_is_a_part_reads_as_over_a_slab():
         sim = cs.Simulator(design, background=build_background(design))
         ball = cs.Body(cs.Sphere(0.01), cs.Pose((0.003, 0, 0.019)), "steel")
         changes.append(sim.step(cs.Scene([ball])).delta[0, 0])
-    assert changes[0] == pytest.approx(changes[1], rel=0.01)
+    assert changes[0] == approx(changes[1], rel=0.01)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import SceneError
@@ -84,7 +85,7 @@ def test_readings_are_those_of_simulators(fleet, simulator):
             scale = np.abs(truth.delta).max() + 1e-18
             assert np.abs(reading.delta[e, s] - truth.delta).max() < 1e-5 * scale
             assert np.abs(reading.capacitance[e, s] - truth.capacitance).max() < 1e-5 * scale
-            assert reading.error[e, s] == pytest.approx(truth.stats.solver_error, rel=1e-3)
+            assert reading.error[e, s] == approx(truth.stats.solver_error, rel=1e-3)
 
 
 def test_jacobians_are_those_of_simulators(fleet, simulator):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from test_fleet import BODIES, poses
 
 import capsense as cs
@@ -173,10 +174,10 @@ def test_noise_on_warp_is_that_of_the_chip(walk):
     both = both.transpose(1, 0, 2, 3).reshape(2, 64, -1)
     for m in (1, 8):
         truth, found = (np.sqrt((allan_deviation(x, [m])[0] ** 2).mean()) for x in both)
-        assert found == pytest.approx(truth, rel=0.05)
+        assert found == approx(truth, rel=0.05)
     middle, spread = both[:, -1].mean(axis=1), both[:, -1].std(axis=1)
     assert abs(middle[1] - middle[0]) < 4 * np.hypot(*spread) / both.shape[2] ** 0.5
-    assert spread[1] == pytest.approx(spread[0], rel=0.1)
+    assert spread[1] == approx(spread[0], rel=0.1)
     together = np.corrcoef(both[1][:, :200].T)
     np.fill_diagonal(together, 0.0)
     assert np.abs(together).mean() < (0.15 if walk == 0.0 else 0.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import SceneError
@@ -25,9 +26,9 @@ def test_a_ball_is_pressed_in_as_deep_as_a_foundation_says(foam_field: cs.Design
     reading = cs.Simulator(foam_field).step(cs.Scene([ball(0.5)]))
     assert reading.touch is not None
     depth = np.sqrt(0.5 * 0.002 / (np.pi * 60e3 * RADIUS))
-    assert reading.touch.total == pytest.approx(0.5, rel=1e-9)
-    assert reading.touch.compression[0] == pytest.approx(depth, rel=0.03)
-    assert reading.touch.force == pytest.approx([0.5, 0.0], rel=0.02)
+    assert reading.touch.total == approx(0.5, rel=1e-9)
+    assert reading.touch.compression[0] == approx(depth, rel=0.03)
+    assert reading.touch.force == approx([0.5, 0.0], rel=0.02)
 
 
 def test_fleets_feel_what_simulators_feel(foam_field: cs.Design) -> None:
@@ -52,9 +53,9 @@ def test_fleets_feel_what_simulators_feel(foam_field: cs.Design) -> None:
         np.testing.assert_allclose(
             found.touch.compression[e, 0], truth.touch.compression, rtol=1e-9
         )
-        assert found.touch.total[e, 0] == pytest.approx(truth.touch.total, rel=1e-9)
+        assert found.touch.total[e, 0] == approx(truth.touch.total, rel=1e-9)
     assert not found.touch.force[:, 1].any()  # the second sensor is elsewhere
-    assert found.touch.total[3, 0] == pytest.approx(2.1, rel=1e-9)
+    assert found.touch.total[3, 0] == approx(2.1, rel=1e-9)
 
 
 def test_compression_beside_an_electrode_is_not_above_it(foam_field: cs.Design) -> None:
@@ -74,9 +75,9 @@ def test_fleets_press_bodies_by_their_own_forces(foam_field: cs.Design) -> None:
     fleet.change(0, ball(), [1])
     where = np.broadcast_to(pose(ball()), (2, 1, 7))
     total = fleet.step(where).touch.total[:, 0]
-    assert total[0] == pytest.approx(0.5, rel=1e-9)
+    assert total[0] == approx(0.5, rel=1e-9)
     assert 0.0 < total[1] < 0.1
-    assert fleet.step(where, forces=[[0.2], [np.nan]]).touch.total[0, 0] == pytest.approx(0.2)
+    assert fleet.step(where, forces=[[0.2], [np.nan]]).touch.total[0, 0] == approx(0.2)
 
 
 def test_fleets_refuse_what_they_cannot_do_with_forces(foam_field: cs.Design) -> None:

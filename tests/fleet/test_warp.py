@@ -10,6 +10,7 @@ import warnings
 
 import numpy as np
 import pytest
+from approximate import approx
 from cluster_twin import same_functions, twin_of
 from reference_scenes import diagonal_errors, fleet_of, reference_scenes
 from test_fleet import BODIES, LONG, frames, long_poses, poses, scene
@@ -79,7 +80,7 @@ def test_twin(scenes):
             largest = np.abs(truth.delta).max()
             assert np.abs(d - truth.delta).max() < 2e-5 * largest, s.name
             told = truth.stats.solver_error
-            assert error[e] == pytest.approx(told, rel=1e-3, abs=2e-5 * largest), s.name
+            assert error[e] == approx(told, rel=1e-3, abs=2e-5 * largest), s.name
 
 
 def test_wide_bodies_near_contact():
@@ -98,7 +99,7 @@ def test_wide_bodies_near_contact():
             largest = np.abs(truth.delta).max()
             assert np.abs(reading.delta.numpy()[e, 0] - truth.delta).max() < 1e-4 * largest
             error = reading.error.numpy()[e, 0]
-            assert error == pytest.approx(truth.stats.solver_error, rel=1e-3)
+            assert error == approx(truth.stats.solver_error, rel=1e-3)
 
 
 def test_long_bodies_are_cut():
@@ -299,7 +300,7 @@ def test_functions_that_add_nothing_are_left_out(lossy):
     found = ((rows.numpy() + 1j * quadrature.numpy()) ** 2).sum()
     some = [0, 2]
     truth = phi[some] @ np.linalg.solve(whole[np.ix_(some, some)], phi[some])
-    assert found == pytest.approx(truth, rel=1e-5)
+    assert found == approx(truth, rel=1e-5)
 
 
 MODULES = [

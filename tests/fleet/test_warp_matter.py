@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from approximate import approx
 from cluster_twin import same_functions, twin_of
 from test_fleet import frames, poses, scene
 
@@ -93,7 +94,7 @@ def test_lossy_matter_on_the_cpu():
         np.testing.assert_allclose(
             reading.conductance[e, s], wanted, rtol=0, atol=1e-5 * np.abs(wanted).max()
         )
-        assert reading.error[e, s] == pytest.approx(truth.stats.solver_error, rel=1e-3)
+        assert reading.error[e, s] == approx(truth.stats.solver_error, rel=1e-3)
     with pytest.raises(SceneError, match="lossy matter"):
         fleet.step(where, sensors, jacobian=True)
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
+from approximate import approx
 
 
 def near(expected: Any, rel: float) -> Any:
     """Equal within a relative error."""
-    return pytest.approx(expected, rel=rel, abs=0.0)
+    return approx(expected, rel=rel, abs=0.0)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import MissingDependencyError
@@ -39,26 +40,26 @@ def test_stature_by_percentile() -> None:
     """The 5th and 95th percentile that the spread was made from, to their rounding."""
     for sex, low, high in (("male", 1.649, 1.869), ("female", 1.518, 1.724)):
         found = [Build(sex, percentile=q).height for q in (5, 95)]  # type: ignore[arg-type]
-        assert found[1] - found[0] == pytest.approx(high - low, abs=5e-4)
-        assert found == pytest.approx([low, high], abs=0.01)
+        assert found[1] - found[0] == approx(high - low, abs=5e-4)
+        assert found == approx([low, high], abs=0.01)
 
 
 def test_sizes_follow_the_tables() -> None:
     """Measured back from the capsules: lengths, circumferences, the hand's section."""
     build = Build("female", stature=1.70, girth=1.1)
     segments = {s.name: s for s in arm(build).segments}
-    assert -segments["forearm"].origin[2] == pytest.approx(0.186 * 1.70)
-    assert -segments["hand"].origin[2] == pytest.approx(0.146 * 1.70)
+    assert -segments["forearm"].origin[2] == approx(0.186 * 1.70)
+    assert -segments["hand"].origin[2] == approx(0.146 * 1.70)
     around = max(p.radius for p in segments["forearm"].parts) * 2 * math.pi
-    assert around == pytest.approx(0.2641 * 1.1 * 1.70 / 1.6285)
+    assert around == approx(0.2641 * 1.1 * 1.70 / 1.6285)
     fingers = segments["hand"].parts[:4]
     thickness = 2 * fingers[0].radius
     breadth = fingers[3].start[0] - fingers[0].start[0] + thickness
-    assert breadth == pytest.approx(0.0782 * 1.1 * 1.70 / 1.6285)
+    assert breadth == approx(0.0782 * 1.1 * 1.70 / 1.6285)
     section = 2 * (breadth - thickness) + math.pi * thickness
-    assert section == pytest.approx(0.1866 * 1.1 * 1.70 / 1.6285)
-    assert lowest(arm(build)) == pytest.approx(-(0.186 + 0.146 + 0.108) * 1.70, abs=2e-4)
-    assert lowest(leg(build)) == pytest.approx(-(0.245 + 0.246 + 0.039) * 1.70, abs=2e-4)
+    assert section == approx(0.1866 * 1.1 * 1.70 / 1.6285)
+    assert lowest(arm(build)) == approx(-(0.186 + 0.146 + 0.108) * 1.70, abs=2e-4)
+    assert lowest(leg(build)) == approx(-(0.245 + 0.246 + 0.039) * 1.70, abs=2e-4)
 
 
 @pytest.mark.parametrize("sex", ["female", "male"])
@@ -133,7 +134,7 @@ def test_sides_mirror(limb: Limb) -> None:
     for a, b in zip(limb.bodies(angles=angles), other.bodies(angles=angles), strict=True):
         assert b.shape == a.shape
         ends = [k.pose.apply([[0, 0, h * k.shape.length / 2] for h in (-1, 1)]) for k in (a, b)]
-        assert ends[1] * (1, -1, 1) == pytest.approx(ends[0], abs=1e-12)
+        assert ends[1] * (1, -1, 1) == approx(ends[0], abs=1e-12)
 
 
 def test_wrong_angles_are_refused() -> None:
@@ -153,7 +154,7 @@ def test_wrong_angles_are_refused() -> None:
 def test_a_person_is_tied_to_ground_once() -> None:
     """The bodies of a limb share the capacitance."""
     bodies = arm().bodies(grounding=100e-12)
-    assert sum(b.grounding for b in bodies) == pytest.approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
+    assert sum(b.grounding for b in bodies) == approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
     assert {b.grounding for b in arm().bodies(grounding="floating")} == {"floating"}
     assert {b.material.name for b in arm().bodies(material="skin")} == {"skin"}
 
@@ -174,15 +175,15 @@ def test_mjcf_stands_as_the_limb_does(limb: Limb) -> None:
     mujoco.mj_forward(model, data)
     for body in limb.bodies(base, angles):
         geom = data.geom(str(body.name))
-        assert geom.xpos == pytest.approx(np.array(body.pose.position), abs=1e-9)
+        assert geom.xpos == approx(np.array(body.pose.position), abs=1e-9)
         axis = geom.xmat.reshape(3, 3)[:, 2]
-        assert abs(axis @ body.pose.rotation[:, 2]) == pytest.approx(1, abs=1e-9)
+        assert abs(axis @ body.pose.rotation[:, 2]) == approx(1, abs=1e-9)
         size = model.geom(str(body.name)).size
         assert isinstance(body.shape, cs.Capsule)
-        assert (size[0], 2 * size[1]) == pytest.approx((body.shape.radius, body.shape.length))
-    assert model.body_mass.sum() == pytest.approx(sum(s.mass for s in limb.segments))
+        assert (size[0], 2 * size[1]) == approx((body.shape.radius, body.shape.length))
+    assert model.body_mass.sum() == approx(sum(s.mass for s in limb.segments))
     ranges = [model.joint(f"{limb.name}_{j.name}").range for j in limb.joints]
-    assert np.array(ranges) == pytest.approx(np.array([(j.lower, j.upper) for j in limb.joints]))
+    assert np.array(ranges) == approx(np.array([(j.lower, j.upper) for j in limb.joints]))
     pasted = f"<mujoco><worldbody>{mjcf_body(limb, base)}</worldbody></mujoco>"
     assert mujoco.MjModel.from_xml_string(pasted).nq == model.nq
 
@@ -211,14 +212,14 @@ def test_urdf_stands_as_the_limb_does(limb: Limb, tmp_path: Path) -> None:
             link = links[f"{limb.name}_{segment.name}"]
             state = p.getLinkState(body, link, computeForwardKinematics=1, physicsClientId=client)
             expected = base @ where[segment.name]
-            assert cs.Pose(*state[4:6]).matrix == pytest.approx(expected.matrix, abs=1e-5)
+            assert cs.Pose(*state[4:6]).matrix == approx(expected.matrix, abs=1e-5)
             shapes = p.getCollisionShapeData(body, link, physicsClientId=client)
             for found, part in zip(shapes, segment.parts, strict=True):
-                assert found[3][:2] == pytest.approx((part.shape.length, part.radius))
+                assert found[3][:2] == approx((part.shape.length, part.radius))
                 middle = cs.Pose(*state[:2]) @ cs.Pose(*found[5:7])
-                assert middle.position == pytest.approx((expected @ part.pose).position, abs=1e-5)
+                assert middle.position == approx((expected @ part.pose).position, abs=1e-5)
                 axes = middle.rotation[:, 2] @ (expected @ part.pose).rotation[:, 2]
-                assert axes == pytest.approx(1, abs=1e-5)
+                assert axes == approx(1, abs=1e-5)
     finally:
         p.disconnect(physicsClientId=client)
 
@@ -234,7 +235,7 @@ def test_an_attached_sensor_knows_a_limb(simulators: Any) -> None:
     scene = cs.mujoco.attach(compiled, data, "pad", simulators("six_patch_bare")).scene()
     assert len(scene) > 2
     assert {b.material.name for b in scene} == {"human"}
-    assert sum(b.grounding for b in scene) == pytest.approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
+    assert sum(b.grounding for b in scene) == approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
 
 
 # -- meshes --------------------------------------------------------------------------------------
@@ -250,7 +251,7 @@ def open_box() -> tuple[np.ndarray, np.ndarray]:
 def test_openings_are_closed() -> None:
     """A box without lid and floor has its volume again."""
     shape = cs.TriMesh(*close_openings(*open_box()))
-    assert shape.volume == pytest.approx(0.4 * 0.5 * 0.6)
+    assert shape.volume == approx(0.4 * 0.5 * 0.6)
 
 
 def test_smplx_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,7 +298,7 @@ def test_smplx_with_a_stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     monkeypatch.setitem(sys.modules, "torch", types.SimpleNamespace(from_numpy=Tensor))
     shape = load_smplx(tmp_path, gender="female", betas=np.zeros(10))
     assert asked == {"path": str(tmp_path), "model_type": "smplx", "gender": "female"}
-    assert shape.volume == pytest.approx(0.12, rel=1e-5)
+    assert shape.volume == approx(0.12, rel=1e-5)
     with pytest.raises(cs.SceneError, match="betas holds a number"):
         load_smplx(tmp_path, betas=[math.nan] * 10)
     with pytest.raises(cs.SceneError, match="has no parameter 'bets'; did you mean 'betas'"):

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import main
@@ -75,7 +76,7 @@ def test_scene_depends_on_seed_and_number_alone(tmp_path: Path) -> None:
     assert all(poses(other, k) != scene for k, scene in enumerate(first))
     assert {len(scene) for scene in first} == {1, 2}
     radii = {s.radius for k in range(200) for _, _, s in poses(spec, k)[1:]}  # type: ignore[attr-defined]
-    assert sorted(radii) == pytest.approx([0.01, 0.015, 0.02])
+    assert sorted(radii) == approx([0.01, 0.015, 0.02])
 
 
 def test_ranges_are_drawn_as_told(tmp_path: Path) -> None:
@@ -85,10 +86,10 @@ def test_ranges_are_drawn_as_told(tmp_path: Path) -> None:
     radius = np.array([b.shape.radius for b in balls])  # type: ignore[attr-defined]
     assert radius.min() > 0.01
     assert radius.max() < 0.03
-    assert radius.mean() == pytest.approx(0.02, abs=0.001)
+    assert radius.mean() == approx(0.02, abs=0.001)
     logs = np.log([b.material.eps_r for b in balls if b.material.name == "soap"])
     assert 200 < len(logs) < 400
-    assert logs.mean() == pytest.approx(np.log(np.sqrt(40)), abs=0.12)
+    assert logs.mean() == approx(np.log(np.sqrt(40)), abs=0.12)
 
 
 def test_labels_of_simple_bodies() -> None:
@@ -101,19 +102,19 @@ def test_labels_of_simple_bodies() -> None:
     assert near is not None
     assert near.body is ball
     assert near.axis is None
-    assert near.distance == pytest.approx(0.04, abs=1e-9)
-    assert near.point == pytest.approx([0.041, 0.027, 0.04], abs=1e-7)
-    assert near.normal == pytest.approx([0, 0, -1], abs=1e-6)
+    assert near.distance == approx(0.04, abs=1e-9)
+    assert near.point == approx([0.041, 0.027, 0.04], abs=1e-7)
+    assert near.normal == approx([0, 0, -1], abs=1e-6)
     aside = outline.nearest(cs.Scene([cs.Body(cs.Sphere(0.02), cs.Pose((0.153, 0.0, 0.1)))]))
     assert aside is not None  # the nearest corner of E3 or E6: (0.053, ±0.01, 0)
-    assert aside.distance == pytest.approx(np.sqrt(0.1**2 + 0.1**2 + 0.01**2) - 0.02, abs=1e-7)
+    assert aside.distance == approx(np.sqrt(0.1**2 + 0.1**2 + 0.01**2) - 0.02, abs=1e-7)
     rod = cs.Body(
         cs.Capsule(0.01, 0.1), cs.Pose.from_euler((0, 0, 0.05), (0, 90, 30), degrees=True)
     )
     found = outline.nearest(cs.Scene([rod]))
     assert found is not None
-    assert found.axis == pytest.approx([np.cos(np.pi / 6), 0.5, 0])
-    assert found.distance == pytest.approx(0.04, abs=1e-6)
+    assert found.axis == approx([np.cos(np.pi / 6), 0.5, 0])
+    assert found.distance == approx(0.04, abs=1e-6)
     assert outline.nearest(cs.Scene()) is None
 
 
@@ -143,10 +144,10 @@ pose = { position = [0, 0, 0.1], euler = [0, 90, 0] }
         b.pose.apply([[0, 0, s * b.shape.length / 2] for s in (-1, 1)])  # type: ignore[attr-defined]
         for b in forearm
     ])  # fmt: skip
-    assert 0.5 * (ends.min(axis=0) + ends.max(axis=0)) == pytest.approx([0, 0, 0.1], abs=1e-12)
-    assert np.ptp(ends, axis=0)[1:] == pytest.approx([0, 0], abs=1e-12)
+    assert 0.5 * (ends.min(axis=0) + ends.max(axis=0)) == approx([0, 0, 0.1], abs=1e-12)
+    assert np.ptp(ends, axis=0)[1:] == approx([0, 0], abs=1e-12)
     assert scene["person_upper_arm_1"].pose.rotation[:, 2] @ forearm[0].pose.rotation[:, 2] == (
-        pytest.approx(np.cos(np.radians(40)))
+        approx(np.cos(np.radians(40)))
     )
 
 
@@ -253,7 +254,7 @@ def test_columns_in_pandas(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     shape = (-1, *simulator.baseline.shape)
     matrices = np.stack(frame["capacitance"]).reshape(shape)
     changes = np.stack(frame["delta"]).reshape(shape)
-    assert matrices - simulator.baseline == pytest.approx(changes, abs=1e-25)
+    assert matrices - simulator.baseline == approx(changes, abs=1e-25)
     for k in (0, 4, 10):
         scene, near, _ = spec.scene(k)
         np.testing.assert_array_equal(changes[k], simulator.step(scene).delta)
@@ -270,7 +271,7 @@ def test_columns_in_pandas(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     told, felt = (np.stack(frame[name])[:, 0] for name in ("code_delta", "self_delta"))
     assert len(np.unique(told - felt)) == 11
     assert np.ptp(felt) > 5e-16
-    assert told == pytest.approx(felt, abs=0.5e-15)
+    assert told == approx(felt, abs=0.5e-15)
 
 
 def test_datasets_of_hugging_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

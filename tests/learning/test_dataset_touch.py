@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import ScenarioError
@@ -38,10 +39,10 @@ def test_what_is_pressed_on_is_a_label(foam_field: cs.Design, tmp_path: Path) ->
     for row in rows:
         scene, near, _ = spec.scene(row["scene"])
         assert near is not None
-        assert row["touch_total"] == pytest.approx(scene[0].force, rel=1e-9)
-        assert row["touch_force"] == pytest.approx([row["touch_total"], 0.0], rel=0.1)
+        assert row["touch_total"] == approx(scene[0].force, rel=1e-9)
+        assert row["touch_force"] == approx([row["touch_total"], 0.0], rel=0.1)
         assert row["touch_compression"][0] > 1e-4
-        assert row["distance"] == pytest.approx(0.002, abs=1e-6)  # it just touches
+        assert row["distance"] == approx(0.002, abs=1e-6)  # it just touches
     columns = spec.table(0).schema
     assert b"N" in columns.field("touch_force").metadata[b"meaning"]
     softer = SPEC.replace("foam.toml", "foam2.toml").replace(str(FOAM.parent), str(tmp_path))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import MissingDependencyError
@@ -117,12 +118,12 @@ def test_reward_where_the_pad_should_be() -> None:
     down = np.diag([1.0, -1.0, -1.0])
     middle, along = np.array([0.3, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
     error, angle = across(np.array([0.0, 0.0, 0.04 + GAP]), down, middle, along, 0.04)
-    assert (error, angle) == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert (error, angle) == approx((0.0, 0.0), abs=1e-12)
     error, _ = across(np.array([0.1, 0.03, 0.08 + GAP]), down, middle, along, 0.04)
-    assert error == pytest.approx(0.05)
+    assert error == approx(0.05)
     skew = np.array([math.cos(0.2), math.sin(0.2), 0.0])
     assert across(np.array([0.3, 0.0, 0.09]), down, middle, skew, 0.04) == (
-        pytest.approx((0.0, 0.2), abs=1e-12)
+        approx((0.0, 0.2), abs=1e-12)
     )
 
 
@@ -155,7 +156,7 @@ def test_latency_and_noise_are_as_set() -> None:
     observation, _ = env.reset(seed=0)
     truth = np.diag(env.skin.read()["pad"].delta) * 1e14
     tare = 1e14 * env.signals.tare["pad"] - 1e14 * np.diag(env.simulator.baseline)
-    assert observation[:6] == pytest.approx(truth - tare, abs=0.15)
+    assert observation[:6] == approx(truth - tare, abs=0.15)
 
 
 def test_ranges_by_name() -> None:
@@ -312,7 +313,7 @@ def test_tare_is_a_mean() -> None:
             env.signals.reset(0.0, seed, away, away)
             tares.append(env.signals.tare["pad"])
     slow, both = np.split(np.array(tares), 2)
-    assert np.std(both - slow) == pytest.approx(0.5e-15, rel=0.15)
+    assert np.std(both - slow) == approx(0.5e-15, rel=0.15)
 
 
 def test_wrapper_adds_and_changes_nothing(tmp_path: Path) -> None:
@@ -329,7 +330,7 @@ def test_wrapper_adds_and_changes_nothing(tmp_path: Path) -> None:
         np.testing.assert_allclose(after["observation"], before, atol=1e-12)
         before, expected, *_ = plain.step(action)
         after, reward, *_ = env.step(action)
-        assert reward == pytest.approx(expected, abs=1e-12)
+        assert reward == approx(expected, abs=1e-12)
         felt.append(after[KEY])
     assert all(len(f) == 12 for f in felt)
     assert np.ptp(np.array(felt)[:, :6], axis=0).max() > 0.1
@@ -353,7 +354,7 @@ def test_wrapper_on_other_models(tmp_path: Path, name: str, body: str) -> None:
     before, expected, *_ = plain.step(action)
     after, reward, *_ = env.step(action)
     np.testing.assert_allclose(after["observation"], before, rtol=1e-4, atol=1e-4)
-    assert reward == pytest.approx(expected, abs=1e-4)
+    assert reward == approx(expected, abs=1e-4)
     assert after[KEY].shape == (12,)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import main
@@ -127,8 +128,8 @@ def test_frames_are_those_of_the_environment(made: Path) -> None:
     for row in mine.to_pylist():
         np.testing.assert_array_equal(row["observation.state"], observation)
         observation, reward, over, cut, facts = env.step(np.array(row["action"], np.float32))
-        assert row["next.reward"] == pytest.approx(reward, rel=1e-6)
-        assert row["next.error"] == pytest.approx(facts["error"], rel=1e-6)
+        assert row["next.reward"] == approx(reward, rel=1e-6)
+        assert row["next.error"] == approx(facts["error"], rel=1e-6)
         assert row["next.done"] == (over or cut)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_field
+from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import BAD_INPUT, OK, main
@@ -63,7 +64,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_expressions() -> None:
     named = {"a": 0.03, "b": 2.0}
-    assert evaluate(" -(a + 1) * b / 4 - 0.5", named) == pytest.approx(-1.015)
+    assert evaluate(" -(a + 1) * b / 4 - 0.5", named) == approx(-1.015)
     for wrong, why in (
         ("a ** 2", "more than"), ("__import__('os')", "more than"), ("a +", "worked out"),
         ("1/(b-2)", "worked out"), ("c", "no parameter"), ("1e999", "finite"),
@@ -82,7 +83,7 @@ def test_example_starts_from_the_packaged_design() -> None:
     design = task.design(task.start)
     assert design.content_hash() == cs.load_design("six_patch_bare").content_hash()
     assert len(task.poses) == 8
-    assert task.poses[-1] == pytest.approx((0.02, 0.05, math.radians(10), math.radians(10)))
+    assert task.poses[-1] == approx((0.02, 0.05, math.radians(10), math.radians(10)))
     content = task.content(task.start)
     assert tomllib.loads(to_toml(content)) == content
     nested = {"a": 1, "t": True, "s": 'x"ü', "b": {"c": [1.5, [2, {"d": 1e-9}]], "e": {"f": "g"}},
@@ -95,7 +96,7 @@ def test_the_page_s_task(tmp_path: Path) -> None:
     (tmp_path / "task.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     task = load_task(tmp_path / "task.toml")
     assert len(task.poses) == 4
-    assert task.start == pytest.approx([0.02])
+    assert task.start == approx([0.02])
 
 
 def quadratic(best: np.ndarray, calls: list[np.ndarray]) -> Any:
@@ -115,7 +116,7 @@ def test_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(DesignTask, "bound", quadratic(best, calls))
     told: list[float] = []
     values, bound = search(task, lambda v, b: told.append(b.cost))
-    assert values == pytest.approx(best, abs=5e-4)
+    assert values == approx(best, abs=5e-4)
     assert len(told) == len(calls) <= 121
     np.testing.assert_array_equal(calls[0], task.start)
     assert bound.cost == min(told)
@@ -149,7 +150,7 @@ def test_command(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert float(rows["found"][1]) > 5.0
     design = cs.load_design(output)
     size = float(rows["found"][1]) * 1e-3
-    assert design.electrodes[0].surface.area == pytest.approx(size**2, rel=2e-3)
+    assert design.electrodes[0].surface.area == approx(size**2, rel=2e-3)
     assert main(["optimise", str(task_file), "-o", "found.txt"]) == BAD_INPUT
     assert main(["optimise", str(task_file), "-o", str(output), "--evaluations", "0"]) == BAD_INPUT
 
@@ -161,7 +162,7 @@ def test_bounds_of_a_task(task_file: Path) -> None:
     task = dataclasses.replace(task, poses=(LimbPose(0.0, 0.02),))
     loud, quiet = (dataclasses.replace(task, noise=n).bound(task.start) for n in (1e-16, 1e-17))
     assert (np.array(quiet.pose) < loud.pose).all()
-    assert loud.cost == pytest.approx(math.sqrt(np.mean(np.square(np.divide(loud.pose, task.one)))))
+    assert loud.cost == approx(math.sqrt(np.mean(np.square(np.divide(loud.pose, task.one)))))
 
 
 @pytest.mark.parametrize(

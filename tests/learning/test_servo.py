@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import SceneError
@@ -27,10 +28,10 @@ def sim() -> cs.Simulator:
 def test_pose_of_the_model(sim: cs.Simulator, pose: LimbPose) -> None:
     """The scene of a pose has that pose, whichever way the capsule points."""
     (body,) = PoseEstimator(sim).scene(pose, 0.04)
-    assert limb_pose([body]) == pytest.approx(pose, abs=1e-12)
+    assert limb_pose([body]) == approx(pose, abs=1e-12)
     turned = body.pose @ cs.Pose((0, 0, 0), (1.0, 0.0, 0.0, 0.0))
-    assert limb_pose([cs.Body(body.shape, turned)]) == pytest.approx(pose, abs=1e-12)
-    assert pose.direction == pytest.approx(
+    assert limb_pose([cs.Body(body.shape, turned)]) == approx(pose, abs=1e-12)
+    assert pose.direction == approx(
         [math.cos(pose.pitch) * math.cos(pose.yaw), math.cos(pose.pitch) * math.sin(pose.yaw),
          math.sin(pose.pitch)]
     )  # fmt: skip
@@ -45,7 +46,7 @@ def test_pose_of_an_arm() -> None:
     bodies = limb.bodies(cs.Pose((-elbow + 0.9 * length, 0.01, 0.06)) @ frame)
     segment = [b for b in bodies if "forearm" in str(b.name)]
     thin = segment[2].shape.radius
-    assert limb_pose(segment) == pytest.approx((0.01, 0.06 - thin, 0, 0), abs=2e-3)
+    assert limb_pose(segment) == approx((0.01, 0.06 - thin, 0, 0), abs=2e-3)
     across = cs.Body(cs.Capsule(0.04, 0.2), cs.Pose((0, 0, 0.1)))
     with pytest.raises(SceneError, match="crosses the plane"):
         limb_pose([across])
@@ -69,7 +70,7 @@ def test_slopes(sim: cs.Simulator, matrix: bool) -> None:
         difference = (a - b) / (2 * step)
         # measured, of the largest: 1.5 %, by a turn 4 %; that by the radius is one-sided
         bound = 0.1 if k == 4 else 0.05 if k == 3 else 0.03
-        assert slopes[:, k] == pytest.approx(difference, abs=bound * np.abs(difference).max())
+        assert slopes[:, k] == approx(difference, abs=bound * np.abs(difference).max())
     assert values.min() > 0 or matrix
 
 
@@ -78,8 +79,8 @@ def test_finds_known_poses(sim: cs.Simulator, pose: LimbPose) -> None:
     """To 1 mm and 1 degree from readings without noise, from the middle of the belief."""
     estimator = PoseEstimator(sim, KNOWN, noise=2e-17, relative=0.0, iterations=8)
     found = estimator.estimate(estimator.model(pose)[0])
-    assert found[:2] == pytest.approx(pose[:2], abs=1e-3)
-    assert found[2:] == pytest.approx(pose[2:], abs=math.radians(1))
+    assert found[:2] == approx(pose[:2], abs=1e-3)
+    assert found[2:] == approx(pose[2:], abs=math.radians(1))
     assert estimator.pose == found
 
 
@@ -89,11 +90,11 @@ def test_unknown_size_and_taper(sim: cs.Simulator) -> None:
     estimator = PoseEstimator(sim, belief, noise=5e-17, relative=0, matrix=True, iterations=10)
     pose = POSES[0]
     (body,) = estimator.scene(pose, 0.05)
-    assert limb_pose([body]).pitch == pytest.approx(pose.pitch - 0.06)
+    assert limb_pose([body]).pitch == approx(pose.pitch - 0.06)
     found = estimator.estimate(estimator.model(pose, 0.05)[0])
-    assert found[:2] == pytest.approx(pose[:2], abs=1e-3)
-    assert found[2:] == pytest.approx(pose[2:], abs=math.radians(1))
-    assert estimator.radius == pytest.approx(0.05, rel=0.1)
+    assert found[:2] == approx(pose[:2], abs=1e-3)
+    assert found[2:] == approx(pose[2:], abs=math.radians(1))
+    assert estimator.radius == approx(0.05, rel=0.1)
     estimator.reset()
     assert estimator.pose == belief.pose
 
@@ -114,7 +115,7 @@ def test_errors_reach_the_bound(sim: cs.Simulator) -> None:
         np.subtract(estimator.estimate(clean + noise * rng.standard_normal(6)), pose)
         for _ in range(200)
     ]
-    assert np.std(errors, axis=0) == pytest.approx(bound, rel=0.25)
+    assert np.std(errors, axis=0) == approx(bound, rel=0.25)
     assert (np.abs(np.mean(errors, axis=0)) < 0.3 * bound).all()
 
 
@@ -124,7 +125,7 @@ def test_bound_without_information_is_the_belief(sim: cs.Simulator) -> None:
     estimator = PoseEstimator(sim, belief, noise=1e-10)
     bound = estimator.covariance(LimbPose(0.01))
     assert estimator.pose == belief.pose, "a bound is no estimate"
-    assert bound == pytest.approx(np.diag(np.square(belief.spread)), abs=1e-7)
+    assert bound == approx(np.diag(np.square(belief.spread)), abs=1e-7)
 
 
 def test_follows_in_a_few_steps(sim: cs.Simulator) -> None:
@@ -140,16 +141,16 @@ def test_follows_in_a_few_steps(sim: cs.Simulator) -> None:
         turn = motion[3:]
         sensor = sensor @ cs.Pose(motion[:3], (*(0.5 * turn), 1.0))
     end = limb_pose([cs.Body(limb.shape, sensor.inverse() @ limb.pose)])
-    assert end == pytest.approx((0.0, 0.05, 0.0, 0.0), abs=2e-3)
+    assert end == approx((0.0, 0.05, 0.0, 0.0), abs=2e-3)
     along = limb.pose.rotation[:, 2]
-    assert np.array(sensor.position) @ along == pytest.approx(0.04, abs=0.01)
+    assert np.array(sensor.position) @ along == approx(0.04, abs=0.01)
 
 
 def test_motion_by_hand() -> None:
     """Towards a limb to the left that is too far, and turned to it."""
     motion = follow(LimbPose(0.01, 0.07, 0.1, 0.2), gap=0.05, gain=2.0, turning=3.0)
-    assert motion == pytest.approx([0, 0.02, 0.04, 0, -0.3, 0.6])
-    assert follow(LimbPose(), speed=0.1) == pytest.approx([0.1, 0, 0, 0, 0, 0])
+    assert motion == approx([0, 0.02, 0.04, 0, -0.3, 0.6])
+    assert follow(LimbPose(), speed=0.1) == approx([0.1, 0, 0, 0, 0, 0])
 
 
 def test_refusals(sim: cs.Simulator) -> None:
@@ -182,7 +183,7 @@ def test_network(tmp_path: Path) -> None:
     other = PoseNetwork.fit(readings, poses, iterations=200)
     for twin in (again, other):
         np.testing.assert_array_equal(net(readings[:9]), twin(readings[:9]))
-    assert net.estimate(readings[0]) == pytest.approx(net(readings[:1])[0])
+    assert net.estimate(readings[0]) == approx(net(readings[:1])[0])
     for wrong in (np.zeros(4), np.full(5, np.inf)):
         with pytest.raises(SceneError, match="finite"):
             net.estimate(wrong)
@@ -205,12 +206,12 @@ def test_distance_model() -> None:
 
     plates = DistanceModel(cs.load_design("six_patch_bare"), scale=2.0)
     ball = cs.Body(cs.Sphere(0.02), cs.Pose((0.038, 0.025, 0.07)))
-    assert plates.read([ball])[5] == pytest.approx(2 * 8.8541878e-12 * 9e-4 / 0.05)
-    assert plates.read([]) == pytest.approx(np.zeros(6))
+    assert plates.read([ball])[5] == approx(2 * 8.8541878e-12 * 9e-4 / 0.05)
+    assert plates.read([]) == approx(np.zeros(6))
     env = policy.DistanceFollow()
     env.reset(seed=1)
     felt, solved = env.skin.read()["pad"], env.skin.skin.read()["pad"]
-    assert np.diag(felt.delta) == pytest.approx(np.diag(solved.delta), rel=1.0)
+    assert np.diag(felt.delta) == approx(np.diag(solved.delta), rel=1.0)
     assert felt.delta[0, 1] == 0.0
     observation, *_ = env.step(np.zeros(5, np.float32))
     assert observation in env.observation_space

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 from p1_twin import capacitance_p1
 from scipy.spatial import Delaunay
 
@@ -56,7 +57,7 @@ def test_electrodes_of_a_mesh_as_a_design() -> None:
     for electrode, y in zip(design.electrodes, (-0.03, 0.0, 0.03), strict=True):
         expected = [[-0.05, y - 0.01, 0], [0.05, y + 0.01, 0]]
         np.testing.assert_allclose(electrode.surface.bounds, expected, atol=1e-12)
-        assert electrode.surface.area == pytest.approx(2e-3)
+        assert electrode.surface.area == approx(2e-3)
     np.testing.assert_allclose(design.domain.lower, (-0.25, -0.25, -0.0025))
     np.testing.assert_allclose(design.domain.upper, (0.25, 0.25, 0.4975))
 
@@ -66,10 +67,10 @@ def test_plate_capacitor() -> None:
     mesh = plates()
     ideal = EPS0 * 0.04**2 / 0.02
     one = cs.Simulator(mesh=MeshSensor(mesh, ["high"], ["low"]))
-    assert one.baseline[0, 0] == pytest.approx(ideal, rel=1e-9)
+    assert one.baseline[0, 0] == approx(ideal, rel=1e-9)
     eps = mesh.cell_values({"lower half": 3.0})
     two = cs.Simulator(mesh=MeshSensor(mesh, ["high"], ["low"], eps))
-    assert two.baseline[0, 0] == pytest.approx(1.5 * ideal, rel=1e-6)
+    assert two.baseline[0, 0] == approx(1.5 * ideal, rel=1e-6)
     both = cs.Simulator(mesh=MeshSensor(mesh, ground=()))
     assert both.electrode_names == ("low", "high")
     np.testing.assert_allclose(both.baseline, ideal * np.array([[1, -1], [-1, 1]]), rtol=1e-9)
@@ -83,7 +84,7 @@ def test_own_boundary_values() -> None:
     mesh = mesh.with_groups(node_groups={"wall": rim})
     x = 100 * at[mesh.node_groups["wall"], 0]
     sim = cs.Simulator(mesh=MeshSensor(mesh, ["wall"], (), profiles={"wall": x + 2}))
-    assert sim.baseline[0, 0] == pytest.approx(EPS0 * 0.04**2 * 0.02 * 100**2, rel=1e-9)
+    assert sim.baseline[0, 0] == approx(EPS0 * 0.04**2 * 0.02 * 100**2, rel=1e-9)
 
 
 def test_an_empty_scene_changes_nothing_on_a_poor_mesh() -> None:

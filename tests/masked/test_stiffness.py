@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from numpy.typing import ArrayLike, NDArray
 from p1_twin import capacitance_p1, link_weights, stiffness
 
@@ -62,7 +63,7 @@ def test_stiffness_is_a_laplacian_with_the_dirichlet_energy():
     slope = np.array([2.0, -3.0, 0.5])
     phi = mesh.points @ slope
     energy = EPS0 * float(eps_r @ mesh.volumes) * float(slope @ slope)
-    assert phi @ (matrix @ phi) == pytest.approx(energy, rel=1e-12)
+    assert phi @ (matrix @ phi) == approx(energy, rel=1e-12)
     weights = link_weights(mesh, eps_r)
     a, b = mesh.edges.T
     np.testing.assert_allclose(weights, -np.asarray(matrix[a, b]).ravel(), atol=1e-14 * scale)
@@ -109,7 +110,7 @@ def test_parallel_plates_with_two_layers_are_exact(solver):
     matrix = solved(mesh, eps_r, ["low", "high"], [], solver)
     np.testing.assert_allclose(matrix, exact * np.array([[1, -1], [-1, 1]]), rtol=1e-9)
     grounded = solved(mesh, eps_r, ["high"], ["low"], solver)
-    assert grounded.item() == pytest.approx(exact, rel=1e-9)
+    assert grounded.item() == approx(exact, rel=1e-9)
 
 
 def sphere_sector(n: int, inner: float = 0.04, outer: float = 0.1) -> TetMesh:

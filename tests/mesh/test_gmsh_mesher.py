@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
+from approximate import approx
 from mesh_test_designs import rectangle, roof, sheet, two_patches
 from p1_twin import boundary_faces, capacitance_p1
 
@@ -45,7 +46,7 @@ def covered_area(mesh: TetMesh, group: str, outline: shapely.Polygon) -> float:
 def test_groups_follow_the_design(patches):
     assert list(patches.node_groups) == ["ground", "E1", "E2", "pour"]
     assert list(patches.cell_groups) == ["plate"]
-    assert patches.volumes.sum() == pytest.approx(0.2**3, rel=1e-9)
+    assert patches.volumes.sum() == approx(0.2**3, rel=1e-9)
 
 
 def test_sheets_are_unions_of_element_faces(patches):
@@ -53,7 +54,7 @@ def test_sheets_are_unions_of_element_faces(patches):
     for item in (*design.electrodes, *design.conductors):
         outline = item.surface.facets[0].polygon
         area = covered_area(patches, item.name, outline)
-        assert area == pytest.approx(outline.area, rel=1e-9)
+        assert area == approx(outline.area, rel=1e-9)
     electrode = patches.points[patches.node_groups["E1"]]
     np.testing.assert_allclose(electrode.min(axis=0), [-0.025, -0.01, 0.0], atol=1e-10)
     np.testing.assert_allclose(electrode.max(axis=0), [-0.005, 0.01, 0.0], atol=1e-10)
@@ -71,10 +72,10 @@ def test_ground_is_the_whole_box_and_nothing_else(patches):
 
 def test_layers_are_unions_of_elements(patches):
     plate = patches.cell_groups["plate"]
-    assert patches.volumes[plate].sum() == pytest.approx(0.08 * 0.06 * 0.002, rel=1e-9)
+    assert patches.volumes[plate].sum() == approx(0.08 * 0.06 * 0.002, rel=1e-9)
     corners = patches.points[patches.tets[plate]]
-    assert corners[..., 2].min() == pytest.approx(-0.002, abs=1e-9)
-    assert corners[..., 2].max() == pytest.approx(0.0, abs=1e-9)
+    assert corners[..., 2].min() == approx(-0.002, abs=1e-9)
+    assert corners[..., 2].max() == approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +94,7 @@ def test_elements_within_a_layer_are_its_thickness_over_layers_across(thickness,
     inside = (np.abs(at[..., :2]) < 0.02001).all(axis=(1, 2))
     level = (np.abs(at[..., 2] - high[2]) < 1e-9).all(axis=1)  # of its top face
     lengths = np.linalg.norm(np.diff(at[inside & level], axis=1)[:, 0], axis=1)
-    assert np.median(lengths) == pytest.approx(wanted, rel=0.2)
+    assert np.median(lengths) == approx(wanted, rel=0.2)
 
 
 def test_element_sizes_grow_from_the_rims():
@@ -106,8 +107,8 @@ def test_element_sizes_grow_from_the_rims():
     away = np.hypot(in_plane, middles[:, 2])
     wanted = np.minimum(2e-3 + 0.4 * away, 0.03)
     # Delaunay tetrahedra have links a little longer than the size asked for: 1.21 measured.
-    assert np.median(lengths / wanted) == pytest.approx(1.2, abs=0.15)
-    assert np.median(lengths[away < 1e-9]) == pytest.approx(2e-3, rel=0.15)
+    assert np.median(lengths / wanted) == approx(1.2, abs=0.15)
+    assert np.median(lengths[away < 1e-9]) == approx(2e-3, rel=0.15)
     assert mesh.quality().min_dihedral > 5.0
     coarse = mesh_design(design, size_at_edges=8e-3, size_far=0.03, growth=0.4)
     assert coarse.n_tets < mesh.n_tets / 2
@@ -130,10 +131,10 @@ def test_capacitance_on_the_mesh_converges_to_the_reference():
         for h in (2e-3, 1e-3)
     )
     errors = np.array([coarse[0], fine[0]]) / reference[0] - 1
-    assert errors == pytest.approx([0.224, 0.115], abs=0.02)
+    assert errors == approx([0.224, 0.115], abs=0.02)
     extrapolated = 2 * fine - coarse
-    assert extrapolated[0] == pytest.approx(reference[0], rel=0.015)
-    assert extrapolated[1] == pytest.approx(reference[1], rel=0.03)
+    assert extrapolated[0] == approx(reference[0], rel=0.015)
+    assert extrapolated[1] == approx(reference[1], rel=0.03)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -145,7 +146,7 @@ def test_holes_of_either_direction(sign, flipped):
     surface = Surface((Facet(ring, np.zeros(3), axes),), sheet(ring).rims)
     design = Design("ring", Domain((0.1, 0.1, 0.1), 0.05), (Electrode("E1", surface),))
     mesh = mesh_design(design, size_at_edges=6e-3)
-    assert covered_area(mesh, "E1", ring) == pytest.approx(12e-4, rel=1e-9)
+    assert covered_area(mesh, "E1", ring) == approx(12e-4, rel=1e-9)
 
 
 def test_tilted_facets_and_shared_ridges():
@@ -156,9 +157,9 @@ def test_tilted_facets_and_shared_ridges():
     on_tilt = (x < 1e-9) & (np.abs(z - np.tan(np.pi / 6) * x) < 1e-9)
     assert (on_flat | on_tilt).all()
     assert (on_flat & on_tilt).sum() >= 6
-    assert x.min() == pytest.approx(-0.02 * np.cos(np.pi / 6), abs=1e-9)
-    assert z.min() == pytest.approx(-0.01, abs=1e-9)
-    assert y.max() == pytest.approx(0.02, abs=1e-9)
+    assert x.min() == approx(-0.02 * np.cos(np.pi / 6), abs=1e-9)
+    assert z.min() == approx(-0.01, abs=1e-9)
+    assert y.max() == approx(0.02, abs=1e-9)
 
 
 def test_a_curved_closed_conductor_is_meshed_facet_by_facet():
@@ -174,7 +175,7 @@ def test_a_curved_closed_conductor_is_meshed_facet_by_facet():
     surface = Surface(tuple(facets), np.empty((0, 2, 3)))
     design = Design("ball", Domain((0.2, 0.2, 0.2), 0.1), (Electrode("E1", surface),))
     mesh = mesh_design(design, size_at_edges=0.01)
-    assert mesh.volumes.sum() == pytest.approx(0.2**3, rel=1e-9)
+    assert mesh.volumes.sum() == approx(0.2**3, rel=1e-9)
 
     def height(points: np.ndarray) -> np.ndarray:
         """Height over the nearest facet plane: zero on this convex surface, negative inside."""
@@ -183,7 +184,7 @@ def test_a_curved_closed_conductor_is_meshed_facet_by_facet():
 
     assert np.abs(height(mesh.points[mesh.node_groups["E1"]])).max() < 1e-8
     inner = height(mesh.centroids) < 0
-    assert mesh.volumes[inner].sum() == pytest.approx(sphere.volume, rel=1e-6)
+    assert mesh.volumes[inner].sum() == approx(sphere.volume, rel=1e-6)
 
 
 def test_overlapping_layers_belong_to_the_last():
@@ -193,8 +194,8 @@ def test_overlapping_layers_belong_to_the_last():
     design = two_patches(layers=(slab("a", -0.01, -0.002), slab("b", -0.004, -0.001)))
     mesh = mesh_design(design, size_at_edges=5e-3, growth=0.8)
     volumes = {name: mesh.volumes[cells].sum() for name, cells in mesh.cell_groups.items()}
-    assert volumes["b"] == pytest.approx(0.06 * 0.06 * 0.003, rel=1e-9)
-    assert volumes["a"] == pytest.approx(0.06 * 0.06 * 0.006, rel=1e-9)
+    assert volumes["b"] == approx(0.06 * 0.06 * 0.003, rel=1e-9)
+    assert volumes["a"] == approx(0.06 * 0.06 * 0.006, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from p1_twin import boundary_faces, link_weights, stiffness
 
 from capsense.constants import EPS0
@@ -29,7 +30,7 @@ def test_nodes_are_numbered_in_c_order_and_cells_own_six_tetrahedra():
 
 def test_tetrahedra_fill_the_box_and_conform():
     mesh = kuhn_tets(X, Y, Z)
-    assert mesh.volumes.sum() == pytest.approx(2.3 * 0.9 * 1.0, rel=1e-12)
+    assert mesh.volumes.sum() == approx(2.3 * 0.9 * 1.0, rel=1e-12)
     # Conforming: the boundary is that of the box, two triangles for each outer lattice face.
     assert len(boundary_faces(mesh)) == 2 * 2 * (3 * 2 + 2 * 4 + 3 * 4)
 
@@ -76,7 +77,7 @@ def test_graded_weights_average_the_four_cross_sections():
                         section += share / 6 * dy[j + a] * dz[k + b]
                 node = (i * 3 + j) * 5 + k
                 expected = EPS0 * section / (X[i + 1] - X[i])
-                assert number[node, node + 15] == pytest.approx(expected, rel=1e-12)
+                assert number[node, node + 15] == approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+from approximate import approx
 
 from capsense.errors import MeshError, MissingDependencyError
 from capsense.mesh import TetMesh, kuhn_tets, load_mesh, save_mesh
@@ -90,7 +91,7 @@ def test_gmsh_reads_and_rewrites_our_msh(mesh, tmp_path, version):
         )
     for name, members in mesh.cell_groups.items():
         volume = mesh.volumes[members].sum()
-        assert got.volumes[got.cell_groups[name]].sum() == pytest.approx(volume, rel=1e-12)
+        assert got.volumes[got.cell_groups[name]].sum() == approx(volume, rel=1e-12)
 
 
 def test_msh_of_another_program(tmp_path):
@@ -184,13 +185,13 @@ def test_published_mesh():
     np.testing.assert_allclose(mesh.centroids, raw["s"] / 100, rtol=1e-12)
     # Three raised steps of 100 mm × 20 mm × 2.5 mm are left out of the 0.5 m cube.
     steps = 3 * 0.1 * 0.02 * 0.0025
-    assert mesh.volumes.sum() == pytest.approx(0.125 - steps, rel=1e-12)
+    assert mesh.volumes.sum() == approx(0.125 - steps, rel=1e-12)
     assert list(mesh.node_groups) == ["ground", "E1", "E2", "E3"]
     for number in (1, 2, 3):
         nodes = mesh.points[mesh.node_groups[f"E{number}"]]
         np.testing.assert_allclose(np.ptp(nodes, axis=0), [0.1, 0.02, 0.0], atol=1e-12)
         np.testing.assert_allclose(nodes[:, 2], 0.0025, rtol=1e-12)
-        assert nodes[:, 1].min() == pytest.approx(0.21 + 0.03 * (number - 1), rel=1e-12)
+        assert nodes[:, 1].min() == approx(0.21 + 0.03 * (number - 1), rel=1e-12)
     ground = mesh.points[mesh.node_groups["ground"]]
     on_box = (np.abs(ground - 0.25) > 0.25 - 1e-9).any(axis=1)
     assert on_box.all()

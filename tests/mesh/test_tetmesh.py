@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from p1_twin import boundary_faces, link_weights
 
 from capsense.errors import MeshError
@@ -49,7 +50,7 @@ def test_boundary_faces_close_the_surface():
     mesh = random_mesh()
     faces = mesh.points[boundary_faces(mesh)]
     areas = np.linalg.norm(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), axis=1)
-    assert areas.sum() / 2 == pytest.approx(6.0, rel=1e-12)
+    assert areas.sum() / 2 == approx(6.0, rel=1e-12)
 
 
 def test_arrays_are_copies_and_read_only():
@@ -113,22 +114,22 @@ def test_moving_a_mesh_keeps_its_shape():
 def test_quality_of_the_regular_tetrahedron():
     quality = TetMesh(REGULAR, np.array([[0, 1, 2, 3]])).quality()
     angle = np.degrees(np.arccos(1 / 3))
-    assert quality.min_dihedral == pytest.approx(angle, rel=1e-12)
-    assert quality.max_dihedral == pytest.approx(angle, rel=1e-12)
-    assert quality.min_radius_ratio == pytest.approx(1.0, rel=1e-12)
-    assert quality.max_aspect == pytest.approx(1.0, rel=1e-12)
-    assert quality.volume == pytest.approx(8 / 3, rel=1e-12)
+    assert quality.min_dihedral == approx(angle, rel=1e-12)
+    assert quality.max_dihedral == approx(angle, rel=1e-12)
+    assert quality.min_radius_ratio == approx(1.0, rel=1e-12)
+    assert quality.max_aspect == approx(1.0, rel=1e-12)
+    assert quality.volume == approx(8 / 3, rel=1e-12)
     assert quality.negative_links == 0
 
 
 def test_quality_of_the_corner_tetrahedron():
     quality = TetMesh(UNIT, np.array([[0, 1, 2, 3]])).quality()
-    assert quality.min_dihedral == pytest.approx(np.degrees(np.arctan(np.sqrt(2))), rel=1e-12)
-    assert quality.max_dihedral == pytest.approx(90.0, rel=1e-12)
+    assert quality.min_dihedral == approx(np.degrees(np.arctan(np.sqrt(2))), rel=1e-12)
+    assert quality.max_dihedral == approx(90.0, rel=1e-12)
     inradius, circumradius = 1 / (3 + np.sqrt(3)), np.sqrt(3) / 2
-    assert quality.min_radius_ratio == pytest.approx(3 * inradius / circumradius, rel=1e-12)
+    assert quality.min_radius_ratio == approx(3 * inradius / circumradius, rel=1e-12)
     # Longest link √2, altitude to the slanted face 1/√3.
-    assert quality.max_aspect == pytest.approx(np.sqrt(6) * np.sqrt(2 / 3), rel=1e-12)
+    assert quality.max_aspect == approx(np.sqrt(6) * np.sqrt(2 / 3), rel=1e-12)
 
 
 def test_negative_links_agree_with_the_link_weights():

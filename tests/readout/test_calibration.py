@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from approximate import approx
 from relative import near
 from scipy import stats
 
@@ -86,7 +87,7 @@ def test_small_changes_on_a_large_base():
     true = 5e-12 * (1 + 1e-5 * np.random.default_rng(0).uniform(0, 1, (200, 1)))
     fit = calibrate(true, 1.02 * true + 3e-13, time)
     assert fit.gain == near([1.02], rel=1e-9)
-    assert fit.drift == pytest.approx([0.0], abs=1e-27)
+    assert fit.drift == approx([0.0], abs=1e-27)
 
 
 def saturated(top, random=0.0, seed=0):
@@ -120,7 +121,7 @@ def test_samples_out_of_range_are_left_out(top, random):
     assert not fit.doubtful.any()
     assert (fit.samples == (flags == 0).sum(axis=0)).all()
     assert (np.isnan(fit.residuals) == (flags != 0)).all()
-    assert np.nanstd(fit.residuals, axis=0) == pytest.approx([1e-15, 1e-15], rel=0.2)
+    assert np.nanstd(fit.residuals, axis=0) == approx([1e-15, 1e-15], rel=0.2)
     with pytest.warns(CalibrationWarning, match="channel 1: many samples share its largest"):
         blind = calibrate(world, measured, instants)
     assert blind.doubtful.all()
@@ -140,7 +141,7 @@ def test_a_sensor_that_is_not_linear_is_doubted():
         fit = calibrate(true, 1.02 * true + size * noise, time)
         assert not fit.doubtful.any()
         if size:
-            assert fit.excess == pytest.approx([1.0, 1.0], abs=0.15)
+            assert fit.excess == approx([1.0, 1.0], abs=0.15)
 
 
 def test_without_drift():
@@ -208,7 +209,7 @@ def test_flicker_covariance_is_its_definition():
     lag = np.abs(time[:, None] - time)
     matrix = variance * sum(np.exp(-lag / tau) for tau in taus)
     found, trace = flicker_covariance(columns, time, 1e-15)
-    assert found == pytest.approx(matrix @ columns, rel=1e-9, abs=1e-42)
+    assert found == approx(matrix @ columns, rel=1e-9, abs=1e-42)
     assert trace == near(np.trace(matrix), rel=1e-12)
 
 
@@ -233,7 +234,7 @@ def test_a_calibrated_model_measures_like_the_sensor():
     again = calibrate(world, rows, instants)
     assert np.abs(again.gain - GAIN).max() < 5 * again.uncertainty[:, 0].max()
     drift_between = DRIFT * (again.epoch - sensor.epoch)
-    assert again.offset == pytest.approx(OFFSET + drift_between, abs=5e-17)
+    assert again.offset == approx(OFFSET + drift_between, abs=5e-17)
     assert again.drift == near(DRIFT, rel=0.05)
     with pytest.raises(ReadoutError, match="list of 3, one per channel"):
         Readout(
@@ -248,7 +249,7 @@ def test_normalisations():
     base = base_capacitance(empty)
     assert base == near([2e-12, 2e-12], rel=1e-12)
     values = np.array([[2e-12, 1e-12], [4e-12, 3e-12]])
-    assert tare(values, base) == pytest.approx(np.array([[0, -1e-12], [2e-12, 1e-12]]), abs=1e-24)
+    assert tare(values, base) == approx(np.array([[0, -1e-12], [2e-12, 1e-12]]), abs=1e-24)
     assert relative_to(values, base) == near(np.array([[1, 0.5], [2, 1.5]]), rel=1e-12)
     assert unit_range(values).tolist() == [[0, 0], [1, 1]]
 
@@ -317,8 +318,8 @@ def test_bad_recordings_are_refused(make, words):
 
 
 def test_base_of_one_channel_or_many():
-    assert base_capacitance([1.0, 2.0, 6.0]) == pytest.approx(3.0)
-    assert base_capacitance([[1.0, 4.0], [3.0, 8.0]]) == pytest.approx([2.0, 6.0])
+    assert base_capacitance([1.0, 2.0, 6.0]) == approx(3.0)
+    assert base_capacitance([[1.0, 4.0], [3.0, 8.0]]) == approx([2.0, 6.0])
     for nothing in (1.0, []):
         with pytest.raises(ReadoutError, match="needs readings"):
             base_capacitance(nothing)
@@ -342,13 +343,13 @@ def test_white_noise_is_what_flicker_leaves_of_the_residuals():
     q = np.linalg.qr(design)[0]
     covered, total = flicker_covariance(q, time, 0.02)
     left = total - np.trace(q.T @ covered)
-    assert explained == pytest.approx(left)
+    assert explained == approx(left)
     squares = ((seen - design @ figures) ** 2).sum()
     white = (squares - left) / 38
     inverse = np.linalg.pinv(design) @ q
     wanted = inverse @ (white * np.eye(2) + q.T @ covered) @ inverse.T
     assert 0.1 * squares < left < 0.9 * squares
-    assert covariance == pytest.approx(wanted)
+    assert covariance == approx(wanted)
 
 
 def test_a_few_samples_far_off_are_doubted():
@@ -360,7 +361,7 @@ def test_a_few_samples_far_off_are_doubted():
         fit = calibrate(true, true + 1e-15 * noise, time)
     left = fit.residuals
     scale = 1.4826 * np.median(np.abs(left - np.median(left, axis=0)), axis=0)
-    assert fit.excess == pytest.approx(np.sqrt((left**2).mean(axis=0)) / scale)
+    assert fit.excess == approx(np.sqrt((left**2).mean(axis=0)) / scale)
 
 
 def test_samples_out_of_order_are_doubted():

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from approximate import approx
 from relative import near
 
 from capsense.errors import ReadoutError
@@ -122,7 +123,7 @@ def test_offset_dac_as_the_host_sets_it():
         readout = Readout.preset("fdc1004", NAMES[:1], noise=False, capdac=start)
         counts = readout([0.0, 0.1], np.full((2, 1), level))
         assert counts.code[0] == round((level - offset) * 2**19 / 1e-12)
-        assert counts.capacitance[0] == pytest.approx(level, abs=1e-18)
+        assert counts.capacitance[0] == approx(level, abs=1e-18)
 
 
 def test_saturation_reaches_the_flags():
@@ -204,11 +205,11 @@ def test_drift_with_temperature():
     for name, options, expected in cases:
         readout = Readout.preset(name, NAMES[:1], noise=False, temperature=35.0, **options)
         found = readout([0.0, 1.0], np.full((2, 1), empty)).capacitance
-        assert found == pytest.approx(np.full(len(found), expected), abs=0.13e-15)
+        assert found == approx(np.full(len(found), expected), abs=0.13e-15)
     damp = {"humidity": 80.0, "offset_per_percent": 1e-16, "gain_per_percent": 1e-4}
     readout = Readout.preset("fdc1004", NAMES[:1], noise=False, **damp)
     found = readout([0.0, 1.0], np.full((2, 1), empty)).capacitance
-    assert found == pytest.approx(np.full(len(found), empty * 1.003 + 3e-15), abs=1e-18)
+    assert found == approx(np.full(len(found), empty * 1.003 + 3e-15), abs=1e-18)
 
 
 def test_pace_and_latency_of_the_host():

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from approximate import approx
 from relative import near
 
 from capsense.errors import ReadoutError
@@ -62,8 +63,8 @@ def test_quantisation_error_is_uniform():
 def test_zero_code():
     """Analytic: 0 F is the code ``zero``, and one lsb more is the code after it."""
     law = LinearLaw(1e-15, 0, 2**16 - 1, 2**15)
-    assert law.level(np.array([0.0, 1e-15])) == pytest.approx([2**15, 2**15 + 1])
-    assert law.capacitance(np.array([2**15, 2**15 + 1])) == pytest.approx([0.0, 1e-15], abs=1e-27)
+    assert law.level(np.array([0.0, 1e-15])) == approx([2**15, 2**15 + 1])
+    assert law.capacitance(np.array([2**15, 2**15 + 1])) == approx([0.0, 1e-15], abs=1e-27)
 
 
 def test_full_scale_codes():
@@ -94,7 +95,7 @@ def test_nonlinearity(share):
     law, straight = LinearLaw(1e-15, -8000, 8000, nonlinearity=share), LinearLaw(1e-15, -8000, 8000)
     at = np.array([-8e-12, -4e-12, 0.0, 4e-12, 8e-12, 9e-12])
     expected = share * 16000 * np.array([0.0, 0.75, 1.0, 0.75, 0.0, 0.0])
-    assert law.level(at) - straight.level(at) == pytest.approx(expected, abs=1e-9)
+    assert law.level(at) - straight.level(at) == approx(expected, abs=1e-9)
     line = np.linspace(-9e-12, 9e-12, 5000)
     assert (np.diff(law.level(line)) > 0).all()
     assert np.abs(law.level(line) - straight.level(line)).max() == near(
@@ -160,8 +161,8 @@ def test_dac_steps():
         value, flags = Conversion(LinearLaw(1e-15, -16000, 15999), dac, 1)(np.zeros(1, int), c)[1:]
         assert not flags.any()
         reported[start] = value[0]
-    assert reported[7] - reported[4] == pytest.approx(0.0, abs=1e-15)
-    assert reported[8] - reported[7] == pytest.approx(-1.4e-12, abs=2e-15)
+    assert reported[7] - reported[4] == approx(0.0, abs=1e-15)
+    assert reported[8] - reported[7] == approx(-1.4e-12, abs=2e-15)
     expected = np.array([1.1, 2.0, 3.1, 4.0, 5.1, 6.0, 7.1]) * 1e-12
     assert CapDac(1e-12, 8, (0.1e-12,)).actual()[1:] == near(expected, rel=1e-12)
 
@@ -177,9 +178,9 @@ def test_dac_follows_only_if_it_may():
         assert conversion.dac_codes.tolist() == [1, 4 if follow else 1]
         after = conversion(channel, far)
         assert after[2].tolist() == [0, 0 if follow else Range.ABOVE]
-        assert after[1][0] == pytest.approx(2e-12, abs=1e-15)
+        assert after[1][0] == approx(2e-12, abs=1e-15)
         if follow:
-            assert after[1][1] == pytest.approx(14e-12, abs=1e-15)
+            assert after[1][1] == approx(14e-12, abs=1e-15)
 
 
 @pytest.mark.parametrize("first", [0.0, 9e-12])
@@ -189,7 +190,7 @@ def test_each_channel_sets_its_dac_at_its_first_sample(first):
     conversion(np.array([0]), np.array([first]))
     reported = conversion(np.array([1]), np.array([92e-12]))[1]
     assert conversion.dac_codes.tolist() == [round(first / 3e-12), 31]
-    assert reported == pytest.approx([92e-12], abs=1e-15)
+    assert reported == approx([92e-12], abs=1e-15)
 
 
 def test_dac_follows_both_ways_to_its_ends():

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from approximate import approx
 from relative import near
 
 from capsense.errors import ReadoutError
@@ -43,7 +44,7 @@ def test_conductance_turns_the_phase():
     front = ShuntFrontEnd(shunt=1e-3)
     pure, lossy = front.output(1e-12), front.output(1e-12 - 1j * 3e-6 / front.omega)
     turn = np.angle(lossy / pure)
-    assert turn == pytest.approx(-math.atan2(3e-6, front.omega * 1e-12), rel=1e-6)
+    assert turn == approx(-math.atan2(3e-6, front.omega * 1e-12), rel=1e-6)
 
 
 def test_recovery_is_exact_for_phasors():
@@ -107,7 +108,7 @@ def test_whole_periods_give_the_phasor():
         phasor = demodulate(samples, PAPER.excitation_frequency, 25e6)
         assert abs(phasor - PAPER.output(c)) < 1e-9 * abs(phasor)
         assert PAPER.recover(phasor) == near(c, rel=1e-7)
-        assert demodulated(PAPER.output(c), 1e6, 1e6, 25e6, 2500) == pytest.approx(phasor)
+        assert demodulated(PAPER.output(c), 1e6, 1e6, 25e6, 2500) == approx(phasor)
     batch = rng.standard_normal((4, 5, 100))
     assert demodulate(batch, 1e6, 25e6).shape == (4, 5)
 
@@ -159,17 +160,17 @@ def test_bad_signals_are_refused(make, words):
 def test_wiring_by_hand():
     """Leads add what they have to ground, short of the driven share, or to each other."""
     wiring = Wiring(trace=[1.0, 2.0], cable=4.0, shield_gain=0.75, crosstalk=0.1, coupling=0.5)
-    assert wiring.ground(2) == pytest.approx([2.0, 3.0])
+    assert wiring.ground(2) == approx([2.0, 3.0])
     mixing, offset = wiring.start(np.array([True, False]))
-    assert mixing == pytest.approx(np.array([[1.0, 0.1], [0.1, 1.0]]))
-    assert offset == pytest.approx([2.0, 0.5])
+    assert mixing == approx(np.array([[1.0, 0.1], [0.1, 1.0]]))
+    assert offset == approx([2.0, 0.5])
     given = Wiring(crosstalk=[[0.2, 0.3], [0.4, 0.0]]).start(np.array([True, True]))[0]
-    assert given == pytest.approx(np.array([[1.2, 0.3], [0.4, 1.0]]))
+    assert given == approx(np.array([[1.2, 0.3], [0.4, 1.0]]))
 
 
 @pytest.mark.parametrize("gain", [0.0, 1.0])
 def test_shield_gain_may_be_none_or_perfect(gain):
-    assert Wiring(cable=3.0, shield_gain=gain).ground(1) == pytest.approx([3.0 * (1.0 - gain)])
+    assert Wiring(cable=3.0, shield_gain=gain).ground(1) == approx([3.0 * (1.0 - gain)])
 
 
 @pytest.mark.parametrize(
@@ -195,4 +196,4 @@ def test_closed_form_at_multiples_of_half_the_sample_rate(frequency):
     """The image then folds onto the signal, whole turns away."""
     samples = np.real(0.6 * np.exp(2j * np.pi * frequency * np.arange(8) / 1000.0 + 0.3j))
     found = demodulated(0.6 * np.exp(0.3j), frequency, frequency, 1000.0, 8)
-    assert found == pytest.approx(complex(demodulate(samples, frequency, 1000.0)), abs=1e-12)
+    assert found == approx(complex(demodulate(samples, frequency, 1000.0)), abs=1e-12)

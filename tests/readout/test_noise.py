@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from approximate import approx
 from relative import near
 
 from capsense.errors import ReadoutError
@@ -122,7 +123,7 @@ def test_flicker_noise():
     frequency, density = spectrum(samples)
     band = (frequency > 0.2) & (frequency < 5)
     slope, _ = np.polyfit(np.log(frequency[band]), np.log(density[band]), 1)
-    assert slope == pytest.approx(-1.0, abs=0.05)
+    assert slope == approx(-1.0, abs=0.05)
     h = floor**2 / (2 * math.log(2))
     assert (density[band] * frequency[band]).mean() == near(h, rel=0.05)
 
@@ -152,8 +153,8 @@ def test_mains_is_averaged_and_folded(order):
     stage = Mains(1e-14, 50.0, order)
     samples = run(stage, 1000, 1, conversion=0.004)[:, 0]
     # 50 Hz sampled at 100 Hz alternates in sign, with one amplitude.
-    assert samples[::2] == pytest.approx(np.full(500, samples[0]), abs=1e-20)
-    assert samples[1::2] == pytest.approx(np.full(500, -samples[0]), abs=1e-20)
+    assert samples[::2] == approx(np.full(500, samples[0]), abs=1e-20)
+    assert samples[1::2] == approx(np.full(500, -samples[0]), abs=1e-20)
     shifted = run(Mains(1e-14, 47.0, order), 1000, 1, conversion=0.004)[:, 0]
     expected = 1e-14 * abs(np.sinc(47 * 0.004)) ** order
     assert np.sqrt(2 * np.mean(shifted**2)) == near(expected, rel=1e-3)
@@ -169,7 +170,7 @@ def test_averaging_of_the_mains_is_that_of_the_window():
         window = middle + 0.0073 * ((np.arange(100_000) + 0.5) / 100_000 - 0.5)
         mean = np.sin(2 * math.pi * 50 * window + phase).mean()
         found = process(np.array([0]), np.array([middle]), np.zeros(1))[0]
-        assert found == pytest.approx(mean, abs=1e-9)
+        assert found == approx(mean, abs=1e-9)
 
 
 def test_climate():

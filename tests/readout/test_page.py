@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.readout.config import parse_readout
 from capsense.readout.laws import ShuntFrontEnd
@@ -24,10 +25,10 @@ def test_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
     scope: dict[str, object] = {}
     for number, code in enumerate(blocks("python")):
         exec(compile(code, f"docs/readout.md, snippet {number}", "exec"), scope)
-    assert scope["muscle"].eps_r == pytest.approx(1836, abs=1)  # type: ignore[attr-defined]
-    assert scope["muscle"].sigma == pytest.approx(0.503, abs=5e-4)  # type: ignore[attr-defined]
-    assert scope["cold"].eps_r == pytest.approx(86, abs=0.5)  # type: ignore[attr-defined]
-    assert scope["person"] == pytest.approx(97e-12, abs=0.5e-12)
+    assert scope["muscle"].eps_r == approx(1836, abs=1)  # type: ignore[attr-defined]
+    assert scope["muscle"].sigma == approx(0.503, abs=5e-4)  # type: ignore[attr-defined]
+    assert scope["cold"].eps_r == approx(86, abs=0.5)  # type: ignore[attr-defined]
+    assert scope["person"] == approx(97e-12, abs=0.5e-12)
     assert abs(scope["brightest"][:2]).max() <= 0.0151  # type: ignore[index]
     assert scope["J"].shape == (21, 2240)  # type: ignore[attr-defined]
     fit = scope["fit"]
@@ -48,4 +49,4 @@ def test_error_of_the_recovery_formula() -> None:
     """0.6 % for 1 pF and 1 kΩ at 1 MHz."""
     front_end = ShuntFrontEnd(1e6, 1e3)
     excess = front_end.recover(abs(front_end.output(1e-12))) / 1e-12 - 1
-    assert excess == pytest.approx(6e-3, abs=5e-4)
+    assert excess == approx(6e-3, abs=5e-4)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from approximate import approx
 from maxwell import random_maxwell
 from relative import near
 
@@ -184,11 +185,11 @@ def test_start_shifts_everything():
     times = np.arange(50) * 0.01
     matrices = moving(times, np.random.default_rng(1))
     now, later = plain()(times, matrices), plain()(times + 3600.0, matrices)
-    assert later.time - 3600.0 == pytest.approx(now.time, abs=1e-9)
+    assert later.time - 3600.0 == approx(now.time, abs=1e-9)
     readout = plain()
     first = readout.due(0.2)
     readout.reset(start=3600.0)
-    assert readout.due(3600.2) - 3600.0 == pytest.approx(first, abs=1e-9)
+    assert readout.due(3600.2) - 3600.0 == approx(first, abs=1e-9)
     assert len(readout.due(3600.0)) == 0
     # Instants relative to the start are rounded differently, by 1e-13 s or so.
     assert np.abs(later.capacitance - now.capacitance).max() < 1e-20
@@ -212,8 +213,8 @@ def test_latency_only_delays():
     now, then = prompt(times, matrices), late(times, matrices)
     assert len(now) > len(then) > 150
     assert (then.code == now.code[: len(then)]).all()
-    assert then.time == pytest.approx(now.time[: len(then)] + 0.02, abs=1e-12)
-    assert late.schedule.lag == pytest.approx(0.021, abs=1e-12)
+    assert then.time == approx(now.time[: len(then)] + 0.02, abs=1e-12)
+    assert late.schedule.lag == approx(0.021, abs=1e-12)
     assert np.array_equal(late.due(0.5), prompt.due(0.5))
     for time, matrix in zip(times, matrices, strict=True):
         counts = late.sample(time, matrix)
@@ -467,7 +468,7 @@ def test_held_values_are_of_fixed_size() -> None:
             if own:
                 assert held.capacitance[k] == own[-1].capacitance[-1]
                 assert held.code[k] == own[-1].code[-1]
-                assert held.age[k] == pytest.approx(time - own[-1].time[-1])
+                assert held.age[k] == approx(time - own[-1].time[-1])
             else:
                 assert np.isinf(held.age[k])
     assert np.isfinite(held.age).all()
@@ -523,12 +524,12 @@ def test_loss_reaches_the_demodulated_magnitude():
         counts = join([readout.sample(t, reading) for t in (0.0, 0.01)])
         admittance = omega * c * (1j + tangent)
         volts = abs(10.0 * admittance / (1 / 800.0 + admittance + 1j * omega * 20e-12))
-        assert counts.code[0] == pytest.approx(volts / 0.1 * 2**39, rel=1e-9)
-        assert counts.capacitance[0] == pytest.approx(front.recover(volts), rel=1e-9)
-        assert counts.capacitance[0] == pytest.approx(c * np.hypot(1.0, tangent), rel=0.02)
+        assert counts.code[0] == approx(volts / 0.1 * 2**39, rel=1e-9)
+        assert counts.capacitance[0] == approx(front.recover(volts), rel=1e-9)
+        assert counts.capacitance[0] == approx(c * np.hypot(1.0, tangent), rel=0.02)
         again = readout([0.0, 0.01], [reading, reading])
         assert np.array_equal(again.code, counts.code)
-        assert readout.channel_values(reading) == pytest.approx([c])
+        assert readout.channel_values(reading) == approx([c])
 
 
 def test_loss_passes_wiring_stages_and_an_offset_dac():
@@ -541,7 +542,7 @@ def test_loss_passes_wiring_stages_and_an_offset_dac():
     )
     counts = readout([0.0, 0.01], [reading, reading])
     left = abs(front.output(np.array(0.0e-12 - 1j * 1e-12)))
-    assert np.abs(counts.code[0]) == pytest.approx(left / 0.1 * 2**39, rel=1e-4)
+    assert np.abs(counts.code[0]) == approx(left / 0.1 * 2**39, rel=1e-4)
 
 
 def test_loss_changes_nothing_of_other_laws():

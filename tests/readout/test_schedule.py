@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from relative import near
 
 from capsense.errors import ReadoutError
@@ -91,11 +92,11 @@ def test_bad_schedules_are_refused(make, words):
 def test_times_by_hand():
     """Two slots of 0.1 + 1.0 ms in a period of 5 ms, read 7 ms after a conversion's end."""
     plan = Schedule.sequential(channels=2, conversion=1e-3, gap=1e-4, period=5e-3)
-    assert plan.idle == pytest.approx(2.8e-3)
-    assert plan.period == pytest.approx(5e-3)
-    assert Schedule(((0,),), 2e-3, latency=7e-3).lag == pytest.approx(8e-3)
+    assert plan.idle == approx(2.8e-3)
+    assert plan.period == approx(5e-3)
+    assert Schedule(((0,),), 2e-3, latency=7e-3).lag == approx(8e-3)
     side_by_side = Schedule.simultaneous(channels=3, conversion=1e-3, period=4e-3)
-    assert side_by_side.idle == pytest.approx(3e-3)
+    assert side_by_side.idle == approx(3e-3)
     with pytest.raises(ReadoutError, match="too short"):
         Schedule.sequential(2, 1e-3, gap=1e-4, period=2.1e-3)
 
@@ -107,6 +108,6 @@ def test_no_conversion_takes_no_time():
 
 
 def test_idle_and_rounds():
-    assert idle_of(1.0, 0.25) == pytest.approx(0.75)
+    assert idle_of(1.0, 0.25) == approx(0.75)
     assert idle_of(None, 0.25) == 0.0
     assert list(rounds(5, 2)) == [slice(0, 2), slice(2, 4), slice(4, 6)]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recorded_scenes
+from approximate import approx
 from ball_scenario import ball_scenario
 
 import capsense as cs
@@ -58,11 +59,11 @@ def test_the_first_difference(tampered: Path) -> None:
     found = cs.replay(tampered)
     assert not found.same
     assert (found.steps, found.differing) == (5, 2)
-    assert found.largest == pytest.approx(3e-18, rel=1e-3)
+    assert found.largest == approx(3e-18, rel=1e-3)
     first = found.first
     assert first is not None
     assert (first.step, first.time, first.what) == (2, 0.2, "C(E1, E2) [F]")
-    assert first.recorded - first.replayed == pytest.approx(2e-18, rel=1e-3)
+    assert first.recorded - first.replayed == approx(2e-18, rel=1e-3)
     assert str(first).startswith("step 2 at 0.2 s: C(E1, E2) [F] was -")
 
 

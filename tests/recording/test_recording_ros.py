@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import recorded_scenes
+from approximate import approx
 from mcap.reader import make_reader
 
 import capsense as cs
@@ -232,7 +233,7 @@ def test_signals(recorded: Recorded, decoded: dict[str, list[tuple[int, Any]]]) 
         assert len(found) == 21
         for i, j in ((0, 0), (0, 3), (4, 5)):
             expected = 1e15 * reading.capacitance[i, j], 1e15 * reading.delta[i, j]
-            assert found[f"C_{names[i]}_{names[j]}"] == pytest.approx(expected, rel=1e-9)
+            assert found[f"C_{names[i]}_{names[j]}"] == approx(expected, rel=1e-9)
 
 
 def test_package_of_the_messages() -> None:
@@ -303,7 +304,7 @@ def test_attached_sensor(simulators: Callable[..., cs.Simulator], tmp_path: Path
         assert cs.replay(path).same
         steps = list(cs.open_recording(path).steps())
         assert [s.episode for s in steps] == [0] * 6 + [1] * 6
-        assert steps[5].time == steps[11].time == pytest.approx(6 * model.opt.timestep)
+        assert steps[5].time == steps[11].time == approx(6 * model.opt.timestep)
         with path.open("rb") as file:
             reader = make_reader(file, decoder_factories=[decoder.DecoderFactory()])
             found = [d for *_, d in reader.iter_decoded_messages(topics=["/tf"])]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.codec import design_from_json, design_to_json
@@ -90,9 +91,9 @@ def test_tables_have_columns_of_touch(run: tuple[Path, list[cs.Reading]], tmp_pa
     assert export(recording, tmp_path / "t.csv") == len(FORCES)
     with (tmp_path / "t.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert float(rows[3]["force_total_N"]) == pytest.approx(1.0)
+    assert float(rows[3]["force_total_N"]) == approx(1.0)
     force = readings[3].touch.force[0]  # type: ignore[union-attr]
-    assert float(rows[3]["force_A_N"]) == pytest.approx(force, rel=1e-9)
+    assert float(rows[3]["force_A_N"]) == approx(force, rel=1e-9)
     assert float(rows[3]["compression_B_m"]) == 0.0
     export(recording, tmp_path / "t.npz")
     with np.load(tmp_path / "t.npz") as arrays:
@@ -101,7 +102,7 @@ def test_tables_have_columns_of_touch(run: tuple[Path, list[cs.Reading]], tmp_pa
     pq = pytest.importorskip("pyarrow.parquet")
     export(recording, tmp_path / "t.parquet")
     table = pq.read_table(tmp_path / "t.parquet").to_pydict()
-    assert table["force_total_N"][3] == pytest.approx(1.0)
+    assert table["force_total_N"][3] == approx(1.0)
     assert table["episode"] == [0] * 5
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.reproduce import fig8
 from capsense.reproduce.harness import Outcome, write_outcome
@@ -19,7 +20,7 @@ def test_the_papers_curve() -> None:
     elements, times = fig8.paper_figure()
     assert len(elements) == 15
     assert (np.diff(elements) > 0).all()
-    assert fig8.at_size(elements, times, 30_000) == pytest.approx(107, rel=0.03)
+    assert fig8.at_size(elements, times, 30_000) == approx(107, rel=0.03)
 
 
 @pytest.mark.parametrize("gap", fig8.REFERENCE)
@@ -28,15 +29,15 @@ def test_carried_figures(gap: int) -> None:
     change = np.diag(np.array(table[f"bar {gap}"]) - np.array(table["none"]))
     corner, middle = fig8.REFERENCE[gap]
     expected = [middle if k in fig8.MIDDLE else corner for k in range(6)]
-    assert change == pytest.approx(expected, abs=2e-6)
+    assert change == approx(expected, abs=2e-6)
 
 
 def test_power_laws_are_met_exactly() -> None:
     n = np.array([4e4, 1e4, 2e4])
     t = 3e-5 * n**1.2
-    assert fig8.exponent(n, t) == pytest.approx(1.2)
-    assert fig8.at_size(n, t, 3e4) == pytest.approx(3e-5 * 3e4**1.2)
-    assert fig8.at_size(n, t, 1e4) == pytest.approx(t[1])
+    assert fig8.exponent(n, t) == approx(1.2)
+    assert fig8.at_size(n, t, 3e4) == approx(3e-5 * 3e4**1.2)
+    assert fig8.at_size(n, t, 1e4) == approx(t[1])
     with pytest.raises(ValueError, match="outside 10000 to 40000"):
         fig8.at_size(n, t, 5e4)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.reproduce import limb_curves
 from capsense.reproduce.harness import Outcome, write_outcome
@@ -27,7 +28,7 @@ from capsense.reproduce.limb_curves import (
 @pytest.mark.parametrize("power", [-1.0, -2.5])
 def test_slopes_of_a_power(power: float) -> None:
     z = distances(4)
-    assert slopes(z, 3e-14 * z**power) == pytest.approx([power] * len(RANGES), abs=1e-9)
+    assert slopes(z, 3e-14 * z**power) == approx([power] * len(RANGES), abs=1e-9)
 
 
 def test_no_slope_where_nothing_is_left() -> None:
@@ -42,7 +43,7 @@ def test_no_slope_where_nothing_is_left() -> None:
 def test_zero_of_a_fit(fit: tuple[float, float]) -> None:
     k, b = fit
     z = distances(60)
-    assert zero_distance(z, k / z - b) == pytest.approx(k / b, rel=2e-3)
+    assert zero_distance(z, k / z - b) == approx(k / b, rel=2e-3)
 
 
 def test_distances_hold_the_ends_of_the_ranges() -> None:
@@ -56,8 +57,8 @@ def test_counts_are_tared_codes() -> None:
     """16 bits over 16 pF; what exceeds the range stays at its end."""
     values = 1e-12 + np.array([0.0, 100e-15, 50e-12])
     found = counts(values, 1e-12)
-    assert found[0] == pytest.approx(0, abs=1)
-    assert found[1] == pytest.approx(100e-15 / (16e-12 / 2**16), abs=1)
+    assert found[0] == approx(0, abs=1)
+    assert found[1] == approx(100e-15 / (16e-12 / 2**16), abs=1)
     assert found[2] < 8e-12 / (16e-12 / 2**16) * 2
     assert np.array_equal(found, counts(values, 1e-12))
 
@@ -128,7 +129,7 @@ def test_fit_to_the_arm_finds_its_figures(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(limb_curves, "ARM", tuple(slopes(z[:-3], seen)))
     found = limb_curves.fit_arm(EDGES, z, reading(edges, z))
     assert found.apart < 0.003
-    assert found.figures[1] == pytest.approx(true[1], abs=0.003)
+    assert found.figures[1] == approx(true[1], abs=0.003)
     assert all(low <= value <= high for value, (low, high) in zip(true, found.ranges, strict=True))
 
 

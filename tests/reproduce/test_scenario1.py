@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import main
@@ -31,15 +32,15 @@ def test_way_of_the_bar() -> None:
     """The triangle has its sides' length, rests first, and is nearest in the middle of the line."""
     path = SETUP.path("stripe", "T2", SETUP.panel_speed)
     around = 2 * SETUP.half_line + 2 * np.hypot(SETUP.half_line, STRIPE.depth)
-    assert path.duration * SETUP.panel_speed == pytest.approx(around, rel=1e-12)
+    assert path.duration * SETUP.panel_speed == approx(around, rel=1e-12)
     times = np.array([0.0, SETUP.rest, SETUP.rest + path.duration])
     places = [pose.position for pose in SETUP.poses("stripe", "T2", SETUP.panel_speed, times)]
     np.testing.assert_allclose(places[1:], [places[0]] * 2, atol=1e-12)
     slope = np.tan(np.radians(SETUP.tilt))
     cosine = np.cos(np.radians(SETUP.tilt))
-    assert places[0][0] == pytest.approx(SETUP.offset + SETUP.half_line * cosine, abs=1e-12)
+    assert places[0][0] == approx(SETUP.offset + SETUP.half_line * cosine, abs=1e-12)
     lower = places[0][2] - SETUP.size[2] / 2
-    assert lower == pytest.approx(SETUP.gap + SETUP.half_line * cosine * slope, abs=1e-12)
+    assert lower == approx(SETUP.gap + SETUP.half_line * cosine * slope, abs=1e-12)
 
 
 def test_zig_zag() -> None:
@@ -55,11 +56,11 @@ def test_zig_zag() -> None:
     np.testing.assert_allclose(tips + 1, 74 + 48.07 * np.arange(8), atol=1.5)
     way = 2 * np.hypot(teeth.depth, teeth.pitch / 2)
     period = way / SETUP.panel_speed * SETUP.sample_rate
-    assert np.diff(tips) == pytest.approx(np.full(7, period), abs=1.01)
-    assert place[tips, 0].mean() == pytest.approx(0, abs=0.003)
-    assert np.diff(place[tips, 0]) == pytest.approx(np.full(7, teeth.pitch), abs=0.004)
+    assert np.diff(tips) == approx(np.full(7, period), abs=1.01)
+    assert place[tips, 0].mean() == approx(0, abs=0.003)
+    assert np.diff(place[tips, 0]) == approx(np.full(7, teeth.pitch), abs=0.004)
     near = SETUP.gap + teeth.lift + SETUP.size[2] / 2
-    assert z[tips].mean() == pytest.approx(near, abs=0.004)  # sampled, and the tilt
+    assert z[tips].mean() == approx(near, abs=0.004)  # sampled, and the tilt
     other = SETUP.poses("patch", "T4", SETUP.panel_speed, times)
     nearer = place[:, 2] - np.array([pose.position[2] for pose in other])
     np.testing.assert_allclose(nearer, SETUP.boards["patch"].height, atol=1e-12)
@@ -92,8 +93,8 @@ def test_panels() -> None:
     """The figures of the paper's own simulation are those that were read off."""
     panel = load_curves(SETUP.panels["stripe_T2"])
     assert panel.measured.shape == panel.simulated.shape == (250,)
-    assert panel.measured.min() == pytest.approx(0.755, abs=1e-3)
-    assert panel.simulated.max() == pytest.approx(0.950, abs=1e-3)
+    assert panel.measured.min() == approx(0.755, abs=1e-3)
+    assert panel.simulated.max() == approx(0.950, abs=1e-3)
     assert load_curves(SETUP.panels["stripe_T4"]).measured.shape == (474,)
     assert [name for name, panel in SETUP.panels.items() if not panel.file] == ["patch_T4"]
 
@@ -108,7 +109,7 @@ def test_front_end_dilutes_by_the_stray_capacitance() -> None:
     np.testing.assert_allclose(reading, expected, atol=3e-4)  # one code is 5 aF of 16 fF
     noisy = normalised(SETUP, STRIPE, np.full(2000, empty), empty, noise=True)
     rms = SETUP.noise / (empty + SETUP.stray)
-    assert noisy.std() == pytest.approx(rms, rel=0.1)
+    assert noisy.std() == approx(rms, rel=0.1)
     again = normalised(SETUP, STRIPE, np.full(2000, empty), empty, noise=True)
     np.testing.assert_array_equal(noisy, again)
 
@@ -132,10 +133,10 @@ def test_stored_figures_are_those_of_the_fit(tables: dict[str, Any]) -> None:
     for key, uncertainty in SETUP.uncertainty.items():
         apart = abs(found.setup.value(key) - SETUP.value(key))
         assert apart < 1.5 * uncertainty, key  # by the coarser table
-        assert found.setup.uncertainty[key] == pytest.approx(uncertainty, rel=0.3)
+        assert found.setup.uncertainty[key] == approx(uncertainty, rel=0.3)
     drawn = found.drawn(400)
     for key, uncertainty in found.setup.uncertainty.items():
-        assert np.std([one.value(key) for one in drawn]) == pytest.approx(uncertainty, rel=0.15)
+        assert np.std([one.value(key) for one in drawn]) == approx(uncertainty, rel=0.15)
     for name, panel in SETUP.panels.items():
         if panel.file:
             apart = predicted(found.setup, name, tables[panel.board]) - load_curves(panel).measured
@@ -163,7 +164,7 @@ def test_cases() -> None:
     assert counts["stripe_T2_0.116"] == counts["patch_T2_0.116"] == 250
     assert counts["stripe_T4_0.116"] == counts["patch_T4_0.116"] == 474
     once = SETUP.rest + SETUP.path("stripe", "T3", 0.0166).duration
-    assert counts["stripe_T3_0.0166"] == pytest.approx(once * SETUP.sample_rate, abs=2)
+    assert counts["stripe_T3_0.0166"] == approx(once * SETUP.sample_rate, abs=2)
     assert [case.name for case in scenario1.cases_of(SETUP, reduced=True)] == [
         "stripe_T2_0.116", "stripe_T4_0.116", "patch_T2_0.116", "patch_T4_0.116"
     ]  # fmt: skip

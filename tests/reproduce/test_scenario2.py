@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 
 import capsense as cs
 from capsense.reproduce import limb_worlds, scenario2
@@ -29,10 +30,10 @@ def test_rides_are_the_same_at_every_call_and_within_their_bounds() -> None:
         assert a <= x < a + 0.3 * (b - a)
         assert b - 0.3 * (b - a) < y <= b
     for way in ways:
-        assert way.time == pytest.approx(np.linspace(0.0, 4.0, 21))
+        assert way.time == approx(np.linspace(0.0, 4.0, 21))
         assert clearance(course(PARTICIPANTS["3"], way.which), way.poses) > limb_worlds.CLEARANCE
         x = np.array([p.position[0] for p in way.poses])
-        assert np.sort(x) == pytest.approx(np.linspace(-0.1, 0.1, 21))
+        assert np.sort(x) == approx(np.linspace(-0.1, 0.1, 21))
 
 
 def test_participants_differ() -> None:
@@ -43,14 +44,12 @@ def test_participants_differ() -> None:
 def test_sensor_pose() -> None:
     """It looks down; pitch raises its far end in x, yaw turns counterclockwise from above."""
     level = sensor_pose(0.1, 0.2, 0.3, 0.0, 0.0)
-    assert level.apply([0.0, 0.0, 0.05]) == pytest.approx([0.1, 0.2, 0.25])
+    assert level.apply([0.0, 0.0, 0.05]) == approx([0.1, 0.2, 0.25])
     raised = sensor_pose(0.0, 0.0, 0.0, 0.2, 0.0).apply([0.05, 0.0, 0.0])
-    assert raised == pytest.approx([0.05 * math.cos(0.2), 0.0, 0.05 * math.sin(0.2)])
+    assert raised == approx([0.05 * math.cos(0.2), 0.0, 0.05 * math.sin(0.2)])
     turned = sensor_pose(0.0, 0.0, 0.0, 0.2, 0.3).apply([0.05, 0.0, 0.0])
     flat = 0.05 * math.cos(0.2)
-    assert turned == pytest.approx(
-        [flat * math.cos(0.3), flat * math.sin(0.3), 0.05 * math.sin(0.2)]
-    )
+    assert turned == approx([flat * math.cos(0.3), flat * math.sin(0.3), 0.05 * math.sin(0.2)])
 
 
 @pytest.mark.parametrize(
@@ -60,9 +59,9 @@ def test_course_lies_along_x(which: limb_worlds.Which, upper: str, lower: str) -
     place = course(PARTICIPANTS["2"], which)
     poses = place.limb.forward()
     near, far = (place.frame.apply(poses[name].position) for name in (upper, lower))
-    assert near == pytest.approx(-far, abs=1e-12)
+    assert near == approx(-far, abs=1e-12)
     assert near[0] > 0.1
-    assert near[1:] == pytest.approx([0, 0], abs=1e-12)
+    assert near[1:] == approx([0, 0], abs=1e-12)
 
 
 @pytest.mark.filterwarnings("error:sensor:UserWarning")
@@ -85,7 +84,7 @@ def test_worlds_show_the_limb(simulator: str, simulators: object) -> None:
         bodies = place.limb.bodies(pose.inverse() @ place.frame, grounding=1e-10)
         expected = sim.step(cs.Scene(bodies))
         tolerance = 1.5e-2 * np.abs(expected.self_capacitance - empty).max()
-        assert found == pytest.approx(expected.self_capacitance, abs=tolerance)
+        assert found == approx(expected.self_capacitance, abs=tolerance)
 
 
 def test_codes_follow_the_capacitance() -> None:

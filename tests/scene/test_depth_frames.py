@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from approximate import approx
 from hypothesis import given
 from hypothesis import strategies as st
 from layered_views import view
@@ -208,7 +209,7 @@ def test_back_sides():
     """Analytic: filled, of some thickness, given, and each layer its own."""
     depth = np.full((4, 4), 0.1)
     (body,) = DepthFrame(depth).scene()
-    assert line(body)[0, 0] == pytest.approx(0.1, abs=1e-7)
+    assert line(body)[0, 0] == approx(0.1, abs=1e-7)
     assert line(body)[0, 1] > 5  # behind the largest domain
     (body,) = DepthFrame(depth, back=0.03).scene()
     np.testing.assert_allclose(line(body), [[0.1, 0.13]], atol=1e-7)
@@ -217,7 +218,7 @@ def test_back_sides():
     sleeve_and_arm = np.stack([depth, depth + 0.02])
     sleeve, arm = DepthFrame(sleeve_and_arm, [3.2, np.inf], back=(0.001, "fill")).scene()
     np.testing.assert_allclose(line(sleeve), [[0.1, 0.101]], atol=1e-7)
-    assert line(arm)[0, 0] == pytest.approx(0.12, abs=1e-7)
+    assert line(arm)[0, 0] == approx(0.12, abs=1e-7)
     assert sleeve.material.eps_r == 3.2
     assert arm.material.is_conductor()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.constants import EPS0
 from capsense.scene.materials import GABRIEL
@@ -29,8 +30,8 @@ def test_published_values(tissue: str, kilohertz: int) -> None:
     frequency = 1e3 * kilohertz
     sigma, eps_r = PUBLISHED[kilohertz][TISSUES.index(tissue)]
     found = GABRIEL[tissue].permittivity(frequency)
-    assert found.real == pytest.approx(eps_r, rel=5e-5)
+    assert found.real == approx(eps_r, rel=5e-5)
     if np.isfinite(sigma):
         conductivity = -found.imag * 2 * np.pi * frequency * EPS0
         digit = 1e-5 if tissue == "skin dry" and kilohertz < 1000 else 1e-4
-        assert conductivity == pytest.approx(sigma, abs=0.6 * digit)
+        assert conductivity == approx(sigma, abs=0.6 * digit)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from layered_views import stretch, unite, view
 
 from capsense.errors import SceneError
@@ -52,10 +53,10 @@ def test_a_full_image_is_a_block():
     shape, box = Layers(*BLOCK), Box((0.06, 0.04, 0.1))
     np.testing.assert_allclose(shape.bounds(), box.bounds() + np.array([0, 0, 0.15]), atol=1e-8)
     np.testing.assert_allclose(shape.params, box.params, atol=1e-8)
-    assert shape.volume == pytest.approx(box.volume, rel=1e-6)
-    assert shape.pixel == pytest.approx((0.01, 0.01))
+    assert shape.volume == approx(box.volume, rel=1e-6)
+    assert shape.pixel == approx((0.01, 0.01))
     mesh = shape.to_trimesh()
-    assert mesh.volume == pytest.approx(box.volume, rel=1e-6)
+    assert mesh.volume == approx(box.volume, rel=1e-6)
     np.testing.assert_allclose(mesh.bounds, shape.bounds(), atol=1e-8)
 
 
@@ -100,7 +101,7 @@ def test_volumes_converge(name):
         "box": (Box((0.12, 0.1, 0.06)), Pose.from_euler((0, 0, 0.15), (0.5, 0.4, 0.3))),
     }[name]
     layers = Layers(*view(shape, pose, 128, 0.3), (0.3, 0.3))
-    assert layers.volume == pytest.approx(shape.volume, rel=5e-3)
+    assert layers.volume == approx(shape.volume, rel=5e-3)
     low, high = layers.bounds()
     points = pose.apply(shape.to_trimesh().vertices)
     assert np.all(np.abs(low - points.min(axis=0)) < 0.006)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.constants import EPS0
 from capsense.errors import SceneError
@@ -51,8 +52,8 @@ def test_tissues_follow_the_cole_cole_model(name):
     eps = cole_cole(name, 250e3)
     omega = 2 * np.pi * 250e3
     found = material(name)
-    assert found.eps_r == pytest.approx(eps.real, rel=2e-3)
-    assert found.sigma == pytest.approx(-eps.imag * omega * EPS0, rel=5e-3)
+    assert found.eps_r == approx(eps.real, rel=2e-3)
+    assert found.sigma == approx(-eps.imag * omega * EPS0, rel=5e-3)
 
 
 @pytest.mark.parametrize("name", GABRIEL)
@@ -60,11 +61,11 @@ def test_tissues_follow_the_cole_cole_model(name):
 def test_tissues_at_other_frequencies(name, frequency):
     """Analytic: permittivity and conductivity of the model, together and apart."""
     eps = cole_cole(name, frequency)
-    assert material(name).complex_permittivity(frequency) == pytest.approx(eps, rel=1e-12)
+    assert material(name).complex_permittivity(frequency) == approx(eps, rel=1e-12)
     there = material(name).at(frequency)
-    assert there.eps_r == pytest.approx(eps.real, rel=1e-12)
-    assert there.sigma == pytest.approx(-eps.imag * 2 * np.pi * frequency * EPS0, rel=1e-12)
-    assert there.complex_permittivity(frequency) == pytest.approx(eps, rel=1e-12)
+    assert there.eps_r == approx(eps.real, rel=1e-12)
+    assert there.sigma == approx(-eps.imag * 2 * np.pi * frequency * EPS0, rel=1e-12)
+    assert there.complex_permittivity(frequency) == approx(eps, rel=1e-12)
 
 
 def test_dispersion_is_causal():
@@ -79,7 +80,7 @@ def test_dispersion_is_causal():
 
 def test_matter_without_dispersion_is_the_same_at_any_frequency():
     assert material("glass").at(1e9) is material("glass")
-    assert material("steel").complex_permittivity(1e6).imag == pytest.approx(
+    assert material("steel").complex_permittivity(1e6).imag == approx(
         -6.99e6 / (2 * np.pi * 1e6 * EPS0)
     )
 
@@ -89,7 +90,7 @@ def test_matter_without_dispersion_is_the_same_at_any_frequency():
 )
 def test_water_against_temperature(kelvin, eps_r):
     """Measured: Malmberg and Maryott 1956, good to 0.05; the series to 0.5 %."""
-    assert water(kelvin).eps_r == pytest.approx(eps_r, rel=5e-3)
+    assert water(kelvin).eps_r == approx(eps_r, rel=5e-3)
 
 
 @pytest.mark.parametrize("temperature", [-1.0, 101.0, float("nan")])
@@ -148,7 +149,7 @@ def test_conductor_rule_is_a_magnitude():
     assert not Material("a", 999.0).is_conductor(1e6)
     assert Material("a", 600.0, 801 * omega_eps).is_conductor(1e6)
     assert not Material("a", 600.0, 799 * omega_eps).is_conductor(1e6)
-    assert Material("a", 2.0, omega_eps).complex_permittivity(1e6) == pytest.approx(2 - 1j)
+    assert Material("a", 2.0, omega_eps).complex_permittivity(1e6) == approx(2 - 1j)
 
 
 def test_every_material_names_its_source():

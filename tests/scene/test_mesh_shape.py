@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from numba import njit
 
 from capsense.errors import SceneError
@@ -108,7 +109,7 @@ def test_cavities_stay_and_overlaps_unite():
     outer, inner = Box((0.1, 0.1, 0.1)).to_trimesh(), Box((0.04, 0.04, 0.04)).to_trimesh()
     inner.invert()
     hollow = tri_mesh(trimesh.util.concatenate([outer, inner]))
-    assert hollow.volume == pytest.approx(1e-3 - 6.4e-5)
+    assert hollow.volume == approx(1e-3 - 6.4e-5)
     found = hollow.signed_distance([(0, 0, 0), (0, 0.001, 0.03), (0, 0, 0.06)])
     np.testing.assert_allclose(found, [0.02, -0.01, 0.01], atol=1e-15)
 
@@ -141,7 +142,7 @@ def test_winding_is_mended():
     soup = mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3)
     for v, f in [(mesh.vertices, mesh.faces[:, ::-1]), (mesh.vertices, turned), soup]:
         shape = TriMesh(v, f)
-        assert shape.volume == pytest.approx(good.volume)
+        assert shape.volume == approx(good.volume)
         assert len(shape.vertices) == len(mesh.vertices)
         assert shape.to_trimesh().is_volume
 
@@ -155,7 +156,7 @@ def test_winding_is_mended_part_by_part(seed):
     mesh = trimesh.util.concatenate(parts)
     turn = np.random.default_rng(seed).random(len(mesh.faces)) < 0.5
     shape = TriMesh(mesh.vertices, np.where(turn[:, None], mesh.faces[:, ::-1], mesh.faces))
-    assert shape.volume == pytest.approx(4 * 6e-6)
+    assert shape.volume == approx(4 * 6e-6)
 
 
 def test_pack_uses_the_box_of_the_mesh():
@@ -230,7 +231,7 @@ def test_copies_of_faces_are_dropped():
     shape = TriMesh(V, np.concatenate([F, F[:7, ::-1], F[:3]]))
     assert shape.closed
     assert len(shape.faces) == len(F)
-    assert shape.volume == pytest.approx(TriMesh(V, F).volume)
+    assert shape.volume == approx(TriMesh(V, F).volume)
 
 
 def test_open_surfaces_are_wound_alike():
@@ -275,9 +276,9 @@ def test_point_to_triangle_distance():
     nearest = trimesh.triangles.closest_point(triangles, points)
     np.testing.assert_allclose(found, ((points - nearest) ** 2).sum(axis=1), atol=1e-12)
     sliver = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
-    assert triangle_distance2(sliver, 2.0, 0.0, 4.0) == pytest.approx(16.0)
-    assert triangle_distance2(sliver, 6.0, 0.0, 4.0) == pytest.approx(25.0)
-    assert triangle_distance2(np.zeros((3, 3)), 3.0, 4.0, 0.0) == pytest.approx(25.0)
+    assert triangle_distance2(sliver, 2.0, 0.0, 4.0) == approx(16.0)
+    assert triangle_distance2(sliver, 6.0, 0.0, 4.0) == approx(25.0)
+    assert triangle_distance2(np.zeros((3, 3)), 3.0, 4.0, 0.0) == approx(25.0)
 
 
 def test_pieces_are_the_large_parts_and_the_others_together():
@@ -291,7 +292,7 @@ def test_pieces_are_the_large_parts_and_the_others_together():
     assert shape.parts == 5
     assert len(shape.pieces) == 4
     volumes = sorted(piece.volume for piece in shape.pieces)
-    assert volumes == pytest.approx(sorted([1e-9 + 1.25e-10, 2e-3, 4e-5, 1.25e-4]))
+    assert volumes == approx(sorted([1e-9 + 1.25e-10, 2e-3, 4e-5, 1.25e-4]))
     found = sorted(map(tuple, shape.piece_bounds.transpose(1, 0, 2).reshape(-1, 6).round(9)))
     wanted = [box.bounds.reshape(-1) for box in boxes[:3]]
     low = np.minimum(boxes[3].bounds[0], boxes[4].bounds[0])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from approximate import approx
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -28,7 +29,7 @@ def test_quaternion_order_is_xyzw_on_an_asymmetric_pose():
 
 def test_quaternion_is_normalised():
     pose = Pose(quaternion=(0, 0, 3, 4))
-    assert pose.quaternion == pytest.approx((0, 0, 0.6, 0.8))
+    assert pose.quaternion == approx((0, 0, 0.6, 0.8))
     assert pose == Pose(quaternion=(0, 0, 0.6, 0.8))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from layered_views import unite
 
 from capsense.errors import SceneError
@@ -206,7 +207,7 @@ def test_volumes_converge():
         raster = render_depth(pose.apply(mesh.vertices), mesh.faces, (0.16, 0.16), (n, n))
         layers = raster.layers()
         assert isinstance(layers, Layers)
-        assert layers.volume == pytest.approx(
+        assert layers.volume == approx(
             np.nansum(raster.back - raster.front) * (0.16 / n) ** 2, rel=1e-5
         )
         errors.append(abs(layers.volume / mesh.volume - 1))

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 from capsense.errors import SceneError
 from capsense.scene import (
@@ -173,4 +174,4 @@ def test_a_mesh_of_trimesh() -> None:
     mesh = trimesh.creation.icosphere(radius=0.03)
     with pytest.raises(SceneError, match=r"give a TriMesh\(mesh\.vertices, mesh\.faces\)"):
         Body(mesh)
-    assert Body(TriMesh(mesh.vertices, mesh.faces)).shape.volume == pytest.approx(mesh.volume)
+    assert Body(TriMesh(mesh.vertices, mesh.faces)).shape.volume == approx(mesh.volume)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.errors import SceneError
 from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Sphere, TriMesh
@@ -52,7 +53,7 @@ def test_bounds_volume_and_surface_mesh(shape):
     mesh = shape.to_trimesh()
     assert mesh.is_watertight
     np.testing.assert_allclose(mesh.bounds, shape.bounds(), atol=2e-4)
-    assert mesh.volume == pytest.approx(shape.volume, rel=6e-3)
+    assert mesh.volume == approx(shape.volume, rel=6e-3)
     assert np.abs(shape.signed_distance(mesh.vertices)).max() < 1e-9
 
 
@@ -65,7 +66,7 @@ def test_surface_meshes_of_any_size_are_closed(scale):
     )  # fmt: skip
     for shape in kinds:
         mesh = shape.to_trimesh()
-        assert TriMesh(mesh.vertices, mesh.faces).volume == pytest.approx(shape.volume, rel=6e-3)
+        assert TriMesh(mesh.vertices, mesh.faces).volume == approx(shape.volume, rel=6e-3)
 
 
 @shapes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 from capsense.errors import SceneError
 from capsense.scene import (
@@ -58,7 +59,7 @@ def test_a_closed_surface_has_the_inside_of_its_mesh():
     for faces in (BALL.faces, BALL.faces[:, ::-1]):
         shape = SurfaceMesh(squeezed, RestSurface(BALL.vertices, faces))
         assert shape.closed
-        assert shape.volume == pytest.approx(same.volume)
+        assert shape.volume == approx(same.volume)
         np.testing.assert_allclose(shape.signed_distance(p), same.signed_distance(p), atol=1e-15)
         assert shape.to_trimesh().is_watertight
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import pytest
+from approximate import approx
 from stopped_clock import StoppedClock
 
 from capsense.server.session import Allowance
@@ -20,7 +20,7 @@ def test_spends_what_is_there_and_what_comes_back(clock: StoppedClock) -> None:
     bucket.rate = 100
     bucket.spend(10)
     clock.now += 0.05
-    assert bucket.spend(0) == pytest.approx(5)
+    assert bucket.spend(0) == approx(5)
 
 
 def test_what_is_there_at_first(clock: StoppedClock) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from numpy.typing import NDArray
 from reference_scenes import DATA, FEMTO, body_of_json
 
@@ -114,7 +115,7 @@ def test_local_capacitance_of_a_ball_and_a_plate(simulators, gap, mesh):
     arc = np.where(angle > 0.0, angle / np.sin(np.maximum(angle, 1e-9)), 1.0)
     change = (1.0 / z - 1.0 / np.array([held_off(d, length) for d in z])) / arc
     wanted = np.trapezoid(change * 2.0 * math.pi * radius**2 * np.sin(angle), angle)
-    assert c == pytest.approx(wanted / (4.0 * math.pi), rel=0.02)
+    assert c == approx(wanted / (4.0 * math.pi), rel=0.02)
 
 
 @pytest.mark.parametrize(("shape", "half"), [(SHEET, 0.0005), (cs.Sphere(0.012), 0.012)])
@@ -188,7 +189,7 @@ def test_jacobian_between_bodies(simulators):
     found = np.diagonal(sim.step(scene(0.0), jacobian=True).jacobian[1, :, :, 2])
     k = int(np.abs(slope).argmax())
     assert slope[k] < 0.0
-    assert found[k] == pytest.approx(slope[k], rel=0.02)
+    assert found[k] == approx(slope[k], rel=0.02)
 
 
 def test_surfaces_that_change_have_no_such_pairs(simulators):

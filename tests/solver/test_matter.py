@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from approximate import approx
 
 from capsense.solver.tree.matter import UNIT, Matter
 
@@ -25,8 +26,8 @@ def test_conductors_have_the_energy_of_their_capacitance_to_ground() -> None:
 
     A ball of one metre has 111.265 pF.
     """
-    assert tie(INF, 111.265e-12) == pytest.approx(1.0, rel=1e-6)
-    assert tie(INF, 3e-12) == pytest.approx(UNIT / 3e-12, rel=1e-12)
+    assert tie(INF, 111.265e-12) == approx(1.0, rel=1e-6)
+    assert tie(INF, 3e-12) == approx(UNIT / 3e-12, rel=1e-12)
     assert tie(INF, INF) == 0.0
     assert tie(INF, 0.0) == INF
 
@@ -43,7 +44,7 @@ def test_displacement_current_comes_in_between_300_and_3000(eps: float, share: f
         if share == 0:
             assert abs(found) > 1e5
         else:
-            assert found == pytest.approx(own + 5.0 / (share * eps * 0.02), rel=1e-9)
+            assert found == approx(own + 5.0 / (share * eps * 0.02), rel=1e-9)
     assert tie(300.0, INF) == tie(5.0, INF) == tie(eps, 0.0) == INF
 
 
@@ -53,7 +54,7 @@ def test_current_of_losses_always_counts(eps: complex) -> None:
     x = min(max(math.log10(eps.real / 300.0), 0.0), 1.0)
     current = eps.real * x * x * (3 - 2 * x) + 1j * eps.imag
     found = tie(eps, 4e-12, 0.05)
-    assert found == pytest.approx(UNIT / 4e-12 + 5.0 / (current * 0.05), rel=1e-12)
+    assert found == approx(UNIT / 4e-12 + 5.0 / (current * 0.05), rel=1e-12)
     assert matter(eps, INF).lossy
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
 from capsense.solver.bodies.panels import SurfacePanels, panels_of
@@ -70,18 +71,18 @@ def longest(panels: SurfacePanels) -> float:
 def test_reduced_round_bodies_keep_their_capacitance(mesh, shape, count):
     """Differential: a primitive of 900 panels, to 0.2 %; some meshes are shorter by 0.1 %."""
     expected = rigid_shape(panels_of(shape, 900)).capacitance
-    assert free(mesh, count) == pytest.approx(expected, rel=2e-3)
+    assert free(mesh, count) == approx(expected, rel=2e-3)
 
 
 def test_a_few_triangles_make_a_ball():
     """Analytic: a hundred triangles, as a finger of a person has, are right to 0.3 %."""
-    assert free(BALL, 100) == pytest.approx(0.05, rel=3e-3)
+    assert free(BALL, 100) == approx(0.05, rel=3e-3)
 
 
 def test_crossing_parts():
     """Differential: a hand of five parts, 500 triangles against 2,000."""
     mesh = hand()
-    assert free(mesh, 500) == pytest.approx(free(mesh, 2000), rel=5e-3)
+    assert free(mesh, 500) == approx(free(mesh, 2000), rel=5e-3)
 
 
 def test_small_parts_have_triangles_of_their_own():
@@ -123,7 +124,7 @@ def test_cracks_and_pinches_do_not_keep_a_mesh_from_being_reduced():
     panels = panels_of(np.array(cracked.triangles), 400)
     assert 350 < len(panels) < 520
     whole = free(cylinder(0.04, 0.2, 40), 1200)
-    assert rigid_shape(panels).capacitance == pytest.approx(whole, rel=1e-2)
+    assert rigid_shape(panels).capacitance == approx(whole, rel=1e-2)
     fins = np.array(BALL.triangles)[::50] * [[[1.0], [1.0], [1.3]]]
     panels = panels_of(np.concatenate([BALL.triangles, fins]), 500)
     assert not panels.closed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 import capsense as cs
 from capsense.scene.pose import Pose
@@ -41,10 +42,10 @@ def test_distances_are_those_of_the_shape(name):
         exact = shape.signed_distance(pose.inverse().apply(points))
         for point, distance in zip(points, exact, strict=True):
             found, faces = nearest(record[0], *point, out, room)
-            assert found == pytest.approx(distance, abs=1e-8)
-            assert np.linalg.norm(out[:3] - point) == pytest.approx(abs(distance), abs=1e-8)
+            assert found == approx(distance, abs=1e-8)
+            assert np.linalg.norm(out[:3] - point) == approx(abs(distance), abs=1e-8)
             on = shape.signed_distance(pose.inverse().apply(out[None, :3]))[0]
-            assert on == pytest.approx(0.0, abs=1e-8)
+            assert on == approx(0.0, abs=1e-8)
             if faces == 1 and distance > 1e-6:  # a face is met along its normal
                 way = (point - out[:3]) / distance
                 np.testing.assert_allclose(out[3:6], way, atol=1e-6)
@@ -60,7 +61,7 @@ def test_lowest_points_bound_the_shape(name):
         lowest = pose.apply(points)[:, 2].min()
         assert low <= lowest + 2e-5
         if name not in ("mesh",):  # of meshes, a box around them counts
-            assert low == pytest.approx(lowest, abs=6e-4)
+            assert low == approx(lowest, abs=6e-4)
 
 
 def test_edges_and_faces_of_a_box():
@@ -68,7 +69,7 @@ def test_edges_and_faces_of_a_box():
     write_outline(record[0], cs.Box((0.02, 0.02, 0.02)))
     record["scale"], record["rotation"] = 1.0, np.eye(3)
     out, room = np.empty(9), np.empty(140)
-    assert nearest(record[0], 0.0, 0.0, 0.03, out, room) == (pytest.approx(0.02), 1)
+    assert nearest(record[0], 0.0, 0.0, 0.03, out, room) == (approx(0.02), 1)
     np.testing.assert_allclose(out[:6], [0, 0, 0.01, 0, 0, 1])
     assert nearest(record[0], 0.0, 0.02, 0.02, out, room)[1] == 2
     np.testing.assert_allclose(out[3:], [0, 1, 0, 0, 0, 1])

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
@@ -97,14 +98,14 @@ def test_potential_and_solid_angle_of_a_panel(shape):
         corners = panels.corners[k]
         potential, field = reference.polygon_integrals(corners, points)
         for p, v, e in zip(points, potential, field, strict=True):
-            assert kernels.polygon_potential(frames[k], *p) == pytest.approx(v, rel=1e-10)
+            assert kernels.polygon_potential(frames[k], *p) == approx(v, rel=1e-10)
             angle = kernels.solid_angle(frames[k], *p)
-            assert angle == pytest.approx(e @ panels.normals[k], abs=1e-10)
+            assert angle == approx(e @ panels.normals[k], abs=1e-10)
         inside = 0.4 * corners[0] + 0.35 * corners[1] + 0.25 * corners[2]
         on = [inside, corners[0], 0.5 * (corners[0] + corners[1])]
         near = np.array(on) + 1e-7 * size * panels.normals[k] + 1e-7 * (inside - np.array(on))
         for p, v in zip(on, reference.polygon_integrals(corners, near)[0], strict=True):
-            assert kernels.polygon_potential(frames[k], *p) == pytest.approx(v, rel=1e-5)
+            assert kernels.polygon_potential(frames[k], *p) == approx(v, rel=1e-5)
 
 
 def test_self_terms():
@@ -137,7 +138,7 @@ def test_self_terms():
     got = np.diag(free_block(panels))
     for k in range(0, len(panels), 29):
         exact = reference.free_entry(panels.corners[k], panels.corners[k], 6, 6)
-        assert got[k] == pytest.approx(exact, rel=5e-5)
+        assert got[k] == approx(exact, rel=5e-5)
 
 
 @pytest.mark.parametrize(
@@ -163,9 +164,9 @@ def test_entries_against_reference(shape, touching, far):
             a, b = panels.corners[k], panels.corners[other]
             exact = 0.5 * (reference.free_entry(a, b) + reference.free_entry(b, a))
             bound = touching if other in order[1:4] else far
-            assert free[k, other] == pytest.approx(exact, rel=bound)
+            assert free[k, other] == approx(exact, rel=bound)
             through = reference.flux_entry(a, b, 6)
-            assert flux[k, other] == pytest.approx(through, rel=0.03, abs=4e-3)
+            assert flux[k, other] == approx(through, rel=0.03, abs=4e-3)
 
 
 def test_flux_of_a_closed_surface():
@@ -385,7 +386,7 @@ def test_point_charge_outside_a_ball(distance, bound):
         share = degree * (eps - 1) / (degree * (eps + 1) + 1)
         exact = float((share * distance ** (-2.0 * degree - 2)).sum())
         (found,) = answer(free + z / (eps - 1), potential[:, None])
-        assert found == pytest.approx(exact, rel=bound)
+        assert found == approx(exact, rel=bound)
 
 
 def test_impedance_is_positive_and_free_on_the_equilibrium_charge():
@@ -468,4 +469,4 @@ def test_two_kites_apart():
         shares.append(area / area.sum())
     inverse = 1.0 / np.linalg.norm(points[0][:, None] - points[1], axis=2)
     found = free_block(polygon_panels(kites, closed=False))[0, 1]
-    assert found == pytest.approx(shares[0] @ inverse @ shares[1], rel=1e-3)
+    assert found == approx(shares[0] @ inverse @ shares[1], rel=1e-3)

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from approximate import approx
 from field_cases import assert_physical
 from interpreted import ON, fewer, limit
 from scipy.spatial.transform import Rotation
@@ -75,7 +76,7 @@ def test_parts_make_up_their_wholes(shape: cs.Shape) -> None:
     normal = normals_of(made)
     for k in cut:
         share, along = charge[children[k]] / charge[k], np.eye(3) - np.outer(normal[k], normal[k])
-        assert share.sum() == pytest.approx(1.0, abs=1e-12)
+        assert share.sum() == approx(1.0, abs=1e-12)
         off = (center[children[k]] - center[k]) @ along
         np.testing.assert_allclose(share @ off, 0.0, atol=1e-12)
         below = along @ second[children[k]] @ along + off[:, :, None] * off[:, None]
@@ -154,7 +155,7 @@ def test_conductors_have_parts() -> None:
         found, size = functions_of(shape, 700, conducting=conducting, finest=finest)
         assert isinstance(found, RefinedShape) == wanted
         if isinstance(found, RefinedShape):
-            assert found.finest * size == pytest.approx(0.85 * finest, rel=0.18)
+            assert found.finest * size == approx(0.85 * finest, rel=0.18)
             other = cs.Capsule(*(1.1 * np.array([shape.radius, shape.length])))
             again = functions_of(other, 700, conducting=True, finest=finest)[0]
             assert again.potential_coefficients is found.potential_coefficients

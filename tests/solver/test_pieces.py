@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from layered_views import view
 
 import capsense as cs
@@ -61,7 +62,7 @@ def test_triangles_against_random_points() -> None:
         np.testing.assert_allclose(found.centers[k], p.mean(axis=0), atol=2e-4)
         np.testing.assert_allclose(found.moments[k], np.cov(p.T), atol=3e-6)
         assert np.trace(found.moments[k]) > 2e-4
-        assert found.areas[k] == pytest.approx(np.linalg.norm(np.cross(b - a, c - a)) / 2)
+        assert found.areas[k] == approx(np.linalg.norm(np.cross(b - a, c - a)) / 2)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 11])
@@ -80,7 +81,7 @@ def test_parts_of_large_triangles_are_parts(n: int) -> None:
         of = face == k
         share = p.areas[of]
         whole = np.linalg.norm(np.cross(b[k] - a[k], c[k] - a[k])) / 2
-        assert share.sum() == pytest.approx(whole)
+        assert share.sum() == approx(whole)
         share = share / share.sum()
         middle = (a[k] + b[k] + c[k]) / 3
         np.testing.assert_allclose(share @ p.centers[of], middle, atol=1e-12)
@@ -112,7 +113,7 @@ def test_moments_add_up_to_those_of_a_plate() -> None:
     total = np.einsum("k,kij->ij", share, p.moments + arms[:, :, None] * arms[:, None, :])
     expected = np.diag([0.3**2, 0.2**2, 0.0]) / 12
     np.testing.assert_allclose(total, turn.rotation @ expected @ turn.rotation.T, atol=1e-12)
-    assert p.areas.sum() == pytest.approx(0.06)
+    assert p.areas.sum() == approx(0.06)
     np.testing.assert_allclose(middle, turn.position)
 
 
@@ -239,7 +240,7 @@ def test_slanted_pixels_are_parallelograms() -> None:
     np.testing.assert_allclose(found.moments[70], sides.T @ sides / 12, rtol=1e-4, atol=1e-9)
     _, _, wanted, sheet = layer_pieces(cs.Layers(front, front + 0.1, (0.8, 0.8)))
     assert len(wanted) == 64  # a back nearer than two pixels is no surface of its own
-    assert sheet == pytest.approx(0.1 / np.sqrt(1 + 0.49 + 0.16), rel=1e-5)
+    assert sheet == approx(0.1 / np.sqrt(1 + 0.49 + 0.16), rel=1e-5)
 
 
 def test_steps_are_no_slopes() -> None:
@@ -259,7 +260,7 @@ def test_a_ball_has_its_area() -> None:
     off = np.linalg.norm(found.centers[:, :2] - middle[:2], axis=1)
     cap = wanted & (off < radius * 2 / np.sqrt(5))
     expected = 4 * np.pi * radius**2 * (1 - 1 / np.sqrt(5))
-    assert found.areas[cap].sum() == pytest.approx(expected, rel=0.01)
+    assert found.areas[cap].sum() == approx(expected, rel=0.01)
 
 
 def block_image(turned: bool) -> tuple[cs.Layers, Array]:
@@ -286,7 +287,7 @@ def test_a_block_has_all_its_faces(turned: bool) -> None:
     for first, faces in ((0, [0, 1, 2]), (2 * 400, [0, 1])):
         of = wanted & (np.arange(len(wanted)) >= first)
         share = found.areas[of] / found.areas[of].sum()
-        assert found.areas[of].sum() == pytest.approx(areas[faces].sum(), rel=1e-5)
+        assert found.areas[of].sum() == approx(areas[faces].sum(), rel=1e-5)
         middle = share @ found.centers[of]
         np.testing.assert_allclose(middle, [0, 0, 0.06], atol=1e-8)
         arms = found.centers[of] - middle
@@ -314,7 +315,7 @@ def test_a_side_ends_where_the_neighbour_begins() -> None:
         rtol=1e-5, atol=1e-12,
     )  # fmt: skip
     outer = 5 * 0.004 * (0.04 + 0.024) + 2 * 3 * 0.004 * (0.04 + 0.024)
-    assert found.areas[sides].sum() == pytest.approx(outer + 5 * 0.004 * 0.016, rel=1e-5)
+    assert found.areas[sides].sum() == approx(outer + 5 * 0.004 * 0.016, rel=1e-5)
 
 
 def test_a_block_with_a_known_back_reads_as_the_block(

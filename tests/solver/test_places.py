@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from approximate import approx
 from plain_leaves import plain_leaves
 from surface_scenes import Placed, green_of, pack, shape_of
 
@@ -145,7 +146,7 @@ def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) 
         green.active_bounds, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]]
     )
     assert green.space.has_face
-    assert outside_fraction(around(np.array(center)), green.space, np.empty(3)) == pytest.approx(
+    assert outside_fraction(around(np.array(center)), green.space, np.empty(3)) == approx(
         expected, abs=1e-9
     )
 
@@ -167,9 +168,7 @@ def test_behind_the_face_near_a_side(axis: int, side: int) -> None:
     green = with_validity(green_of())
     center = np.array([0.0, 0.0, float(green.box[1, 2]) - 0.008])
     center[axis] = green.box[side, axis] + (4.2 * H0 / 4) * (1 - 2 * side)
-    assert outside_fraction(around(center), green.space, np.empty(3)) == pytest.approx(
-        0.5, abs=1e-9
-    )
+    assert outside_fraction(around(center), green.space, np.empty(3)) == approx(0.5, abs=1e-9)
 
 
 def test_distance_of_clusters_from_the_design() -> None:
@@ -204,7 +203,7 @@ def test_clusters_are_looked_at_where_they_are_lifted_to(has_face: bool) -> None
         d, m = wanted[2] - top, green.gap.validity
         if d < 2 * m and has_face:
             wanted[2], raised = top + m + d * d / (4 * m), raised + 1
-        assert square == pytest.approx((wanted[2] - top) ** 2, rel=1e-4)
+        assert square == approx((wanted[2] - top) ** 2, rel=1e-4)
         np.testing.assert_allclose(point[0], wanted, rtol=0, atol=1e-8)
     assert (raised > 0) == has_face
 
@@ -278,4 +277,4 @@ def test_no_image_attracts_more_than_a_mirror(height: float, stretch: float) -> 
     mirror = 4.0 * (square / distance).mean() / side
     floor = mean_inverse(points[0], points[0] * [1, 1, -1] + [0, 0, 2 * green.floor], 0.0)
     wanted = 900.0 + floor - mirror if height < 5e-3 else 0.0
-    assert pairs[0, 0] == pytest.approx(wanted, rel=1e-4)
+    assert pairs[0, 0] == approx(wanted, rel=1e-4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tiny_field
+from approximate import approx
 from covered_discs import EPS, covered_discs
 from covered_discs import MODULUS as E
 from covered_discs import THICKNESS as T
@@ -59,7 +60,7 @@ def test_plate_formula(sim):
 def test_force_of_a_plate(sim):
     """Analytic: pressure E strain over the plate, and over each disc."""
     touch = sim.step(plate(0.5e-3)).touch
-    assert touch.total == pytest.approx(E * 0.25 * 6e-4, rel=1e-3)
+    assert touch.total == approx(E * 0.25 * 6e-4, rel=1e-3)
     np.testing.assert_allclose(touch.force, E * 0.25 * np.pi * 9e-6, rtol=0.03)
     np.testing.assert_allclose(touch.compression, 0.5e-3, rtol=1e-3)
 
@@ -68,9 +69,9 @@ def test_force_of_a_ball(sim):
     """Analytic: E / t times the volume of the cap below the face."""
     touch = sim.step(ball(0.5e-3)).touch
     cap = np.pi * 0.5e-3**2 * (0.01 - 0.5e-3 / 3)
-    assert touch.total == pytest.approx(E / T * cap, rel=0.03)
+    assert touch.total == approx(E / T * cap, rel=0.03)
     assert touch.force[0] > 0.5 * touch.total
-    assert touch.compression[0] == pytest.approx(0.5e-3, rel=0.02)
+    assert touch.compression[0] == approx(0.5e-3, rel=0.02)
 
 
 @pytest.mark.parametrize("shape", [plate, ball])
@@ -80,7 +81,7 @@ def test_a_force_is_a_depth(sim, shape):
     for depth in (0.0, -0.01, 1e-3):
         held = sim.step(shape(depth, force=deep.touch.total))
         np.testing.assert_allclose(held.delta, deep.delta, rtol=0.01)
-        assert held.touch.total == pytest.approx(deep.touch.total, rel=1e-3)
+        assert held.touch.total == approx(deep.touch.total, rel=1e-3)
 
 
 def test_no_force_is_no_overlap(sim):
@@ -189,8 +190,8 @@ def test_relaxation(sim):
     first = sim.step(ball(0.5e-3), time=0.0).touch.total
     half = sim.step(ball(0.5e-3), time=0.05).touch.total
     last = sim.step(ball(0.5e-3), time=2.0).touch.total
-    assert half / first == pytest.approx(1.0 - 0.3 * (1.0 - np.exp(-1.0)), rel=1e-6)
-    assert last / first == pytest.approx(0.7, rel=1e-6)
+    assert half / first == approx(1.0 - 0.3 * (1.0 - np.exp(-1.0)), rel=1e-6)
+    assert last / first == approx(0.7, rel=1e-6)
     sim.reset()
     deep = [sim.step(ball(0.0, force=first), time=t) for t in (0.0, 0.05, 2.0)]
     own = [r.delta[0, 0] for r in deep]
@@ -207,7 +208,7 @@ def test_viscosity_is_linear_and_its_inverse_is_one():
     time = 0.0
     for force in rng.uniform(0.1, 5.0, 40):
         wanted = state.elastic(force, time)
-        assert state.force(wanted, time) == pytest.approx(force, rel=1e-9)
+        assert state.force(wanted, time) == approx(force, rel=1e-9)
         twin.force(wanted, time)
         time += rng.uniform(0.01, 0.5)
     plain = Viscosity(Cover("foam", EPS, *box, StressStrain.linear(E), ((0.4, 0.1),)))
@@ -224,7 +225,7 @@ def test_hysteresis(sim):
     found = [sim.step(ball(0.0, force=f), time=0.1 * k).delta[0, 0] for k, f in enumerate(forces)]
     assert found[4] > 1.02 * found[2]
     assert found[5] > 1.02 * found[1]
-    assert found[6] == pytest.approx(found[0], rel=1e-3)
+    assert found[6] == approx(found[0], rel=1e-3)
 
 
 @pytest.mark.parametrize(

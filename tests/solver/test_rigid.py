@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 import capsense as cs
 from capsense.errors import SolveError
@@ -54,9 +55,9 @@ def test_rigid_shape_with_screened_panels() -> None:
     """Limits: a ball within a ball has no charge, yet its panels count for a millionth each."""
     balls = [trimesh.creation.icosphere(2, radius).triangles for radius in (0.02, 0.008)]
     shape = rigid.rigid_shape(panels_of(np.concatenate(balls), 60))
-    assert shape.capacitance == pytest.approx(0.02, rel=0.01)
+    assert shape.capacitance == approx(0.02, rel=0.01)
     share = shape.tree.charge[shape.tree.panel >= 0]
-    assert share.min() == pytest.approx(rigid.LEAST_CHARGE * share.max(), rel=1e-3)
+    assert share.min() == approx(rigid.LEAST_CHARGE * share.max(), rel=1e-3)
     for values in (shape.tree.points, shape.potential_coefficients, shape.own):
         assert np.isfinite(values).all()
 
@@ -97,6 +98,6 @@ def test_both_ways_to_the_charge_agree(shape: cs.Shape) -> None:
         atol=1e-5 * one.own.max(),
     )
     total = np.linalg.solve(free_block(panels), np.ones(len(panels))).sum()
-    assert one.capacitance == pytest.approx(total, rel=1e-7)
+    assert one.capacitance == approx(total, rel=1e-7)
     if isinstance(shape, cs.Sphere):
-        assert one.capacitance == pytest.approx(0.02, rel=0.02)
+        assert one.capacitance == approx(0.02, rel=0.02)

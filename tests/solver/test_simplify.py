@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from scipy.spatial.transform import Rotation
 
 from capsense.solver.bodies import simplify, triangles
@@ -63,8 +64,8 @@ def test_flat_faces_are_reduced_with_little_error() -> None:
     assert len(reduced) <= 60
     assert closed(reduced)
     whole = 2 * (SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[2] * SIZE[0])
-    assert volume(corners) == pytest.approx(SIZE.prod(), rel=1e-3)
-    assert areas(corners).sum() == pytest.approx(whole, rel=1e-3)
+    assert volume(corners) == approx(SIZE.prod(), rel=1e-3)
+    assert areas(corners).sum() == approx(whole, rel=1e-3)
     apart = np.linalg.norm(moved[:, None] - block(0)[0], axis=2).min(axis=0)
     assert apart.max() < 2e-3 * SIZE.max()
 
@@ -144,7 +145,7 @@ def test_quadrics_against_distances_from_planes(mesh: tuple[Array, Array]) -> No
     for at in range(len(vertices)):
         x, y, z = point = rng.uniform(-1, 1, 3)
         terms = [x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z, 2 * x, 2 * y, 2 * z, 1.0]
-        assert quadrics[at] @ terms == pytest.approx(slow_quadric(vertices, faces, at, point))
+        assert quadrics[at] @ terms == approx(slow_quadric(vertices, faces, at, point))
     pairs = {tuple(sorted((int(f[k]), int(f[(k + 1) % 3])))) for f in faces for k in range(3)}
     assert {tuple(sorted(e)) for e in edges.tolist()} == pairs
     assert len(edges) == len(pairs)
@@ -175,7 +176,7 @@ def test_the_place_of_a_joined_vertex(mesh: tuple[Array, Array]) -> None:
         terms = [x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z, 2 * x, 2 * y, 2 * z, 1.0]
         square = ((vertices[u] - vertices[v]) ** 2).sum()
         expected = max(q @ terms, 0.0) + simplify._EVEN * (q[0] + q[3] + q[5]) * square
-        assert cost == pytest.approx(expected, rel=1e-5)
+        assert cost == approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -241,7 +242,7 @@ def test_a_fitted_ball_lies_as_much_within_as_without() -> None:
     fine, many = ball(2)
     moved = fitted(vertices, faces, fine[many])
     assert volume(vertices[faces]) / volume(fine[many]) < 0.91
-    assert volume(moved[faces]) == pytest.approx(volume(fine[many]), rel=5e-3)
+    assert volume(moved[faces]) == approx(volume(fine[many]), rel=5e-3)
     out = np.einsum("ij,ij->i", moved, vertices)
     np.testing.assert_allclose(moved, out[:, None] * vertices, atol=2e-3)
     shift = np.array([5.0, -2.0, 1.0])
@@ -272,8 +273,8 @@ def test_divided_edges_are_short_and_the_surface_is_the_same(
     points, parts = triangles._divided(vertices, faces, longest)
     small = points[parts]
     assert np.linalg.norm(np.roll(small, -1, axis=1) - small, axis=2).max() <= longest
-    assert areas(small).sum() == pytest.approx(areas(corners).sum(), rel=1e-12)
-    assert volume(small) == pytest.approx(volume(corners), rel=1e-12, abs=1e-15)
+    assert areas(small).sum() == approx(areas(corners).sum(), rel=1e-12)
+    assert volume(small) == approx(volume(corners), rel=1e-12, abs=1e-15)
     assert closed(parts) == closed(faces)
     assert len(np.unique(points.round(9), axis=0)) == len(points)
     np.testing.assert_allclose(normals(small).sum(axis=0), normals(corners).sum(axis=0), atol=1e-12)
@@ -313,7 +314,7 @@ def test_shares_of_parts(areas_of: list[float], count: int) -> None:
     area = np.array(areas_of)
     found = triangles._shares(area, count)
     least = min(triangles._LEAST, triangles._EVENLY * count / len(area))
-    assert found.sum() == pytest.approx(count, abs=len(area))
+    assert found.sum() == approx(count, abs=len(area))
     assert found.min() >= int(least)
     large = found > least + 1
     density = found[large] / area[large] ** triangles._POWER
@@ -330,7 +331,7 @@ def test_slivers_are_halved_where_there_are_triangles_enough() -> None:
     found = triangles._halved(corners, np.zeros(corners.shape[:2], bool), 200)
     np.testing.assert_array_equal(found[:190], usual)
     np.testing.assert_array_equal(found[191:200], short)
-    assert areas(found).sum() == pytest.approx(areas(corners).sum(), rel=1e-12)
+    assert areas(found).sum() == approx(areas(corners).sum(), rel=1e-12)
     pieces = np.concatenate([found[190:191], found[200:]])
     longest = np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=2).max(axis=1)
     assert 0.05 < longest.min() <= longest.max() < 0.13
@@ -345,8 +346,8 @@ def test_halved_triangles_cover_the_same_surface(count: int) -> None:
     sharp = triangles._sharp(vertices, faces)
     found = triangles._halved(corners, np.zeros_like(sharp), count)
     assert count <= len(found) <= 1.25 * count
-    assert areas(found).sum() == pytest.approx(areas(corners).sum(), rel=1e-12)
-    assert volume(found) == pytest.approx(SIZE.prod(), rel=1e-12)
+    assert areas(found).sum() == approx(areas(corners).sum(), rel=1e-12)
+    assert volume(found) == approx(SIZE.prod(), rel=1e-12)
     longest = np.linalg.norm(np.roll(found, -1, axis=1) - found, axis=2).max(axis=1)
     assert longest.max() < 3.0 * longest.min()
     assert (longest**2 / areas(found)).max() < triangles._SLIVER
@@ -362,7 +363,7 @@ def test_halved_triangles_cover_the_same_surface(count: int) -> None:
         near, size = rim(graded.mean(axis=1)), np.sqrt(areas(graded))
         middle = np.median(near)
         assert size[near < 0.5 * middle].mean() < 0.6 * size[near > 2 * middle].mean()
-        assert volume(graded) == pytest.approx(SIZE.prod(), rel=1e-12)
+        assert volume(graded) == approx(SIZE.prod(), rel=1e-12)
 
 
 def test_triangles_that_coincide_are_kept_once() -> None:

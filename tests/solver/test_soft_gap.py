@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -82,9 +83,9 @@ def test_representations_agree(sim: cs.Simulator, name: str, gap: float) -> None
     vertices, faces = mesh.vertices + at, mesh.faces
     exact = sim.step(cs.Scene([cs.Body(shape, cs.Pose(tuple(at)))])).delta[0, 0]
     rigid = sim.step(cs.Scene([cs.Body(cs.TriMesh(vertices, faces))])).delta[0, 0]
-    assert rigid == pytest.approx(exact, rel=0.05)  # a mesh has its corners on the ball
+    assert rigid == approx(exact, rel=0.05)  # a mesh has its corners on the ball
     for scene in (surface(vertices, faces), frame(vertices, faces, at)):
-        assert sim.step(scene).delta[0, 0] == pytest.approx(rigid, rel=0.03)
+        assert sim.step(scene).delta[0, 0] == approx(rigid, rel=0.03)
 
 
 @pytest.mark.parametrize("grounding", ["floating", "grounded"])
@@ -93,7 +94,7 @@ def test_floating_surfaces_are_nodes(pad: cs.Simulator, grounding: str) -> None:
     vertices = _BLOCK.vertices + place(pad, _BLOCK, 0.2e-3)
     soft = pad.step(surface(vertices, _BLOCK.faces, grounding=grounding)).delta[0, 0]
     body = cs.Body(cs.TriMesh(vertices, _BLOCK.faces), grounding=grounding)
-    assert soft == pytest.approx(pad.step(cs.Scene([body])).delta[0, 0], rel=0.02)
+    assert soft == approx(pad.step(cs.Scene([body])).delta[0, 0], rel=0.02)
 
 
 def test_dielectric_surfaces_follow_the_series_formula(pad: cs.Simulator) -> None:
@@ -101,7 +102,7 @@ def test_dielectric_surfaces_follow_the_series_formula(pad: cs.Simulator) -> Non
     at = place(pad, _BALL, 0.1e-3)
     soft = pad.step(surface(_BALL.vertices + at, _BALL.faces, material="glass")).delta[0, 0]
     hard = pad.step(cs.Scene([cs.Body(cs.Sphere(0.012), cs.Pose(tuple(at)), "glass")]))
-    assert soft == pytest.approx(hard.delta[0, 0], rel=0.05)
+    assert soft == approx(hard.delta[0, 0], rel=0.05)
 
 
 def test_pressing_a_surface_onto_the_design(pad: cs.Simulator) -> None:
@@ -118,7 +119,7 @@ def test_pressing_a_surface_onto_the_design(pad: cs.Simulator) -> None:
     assert 0.9 * most < found[-1] < 1.02 * most
     for height, bound in ((-0.5e-3, 1e-3), (-1e-3, 0.02)):  # h0 is 0.37 mm
         pressed = pad.step(surface(flat + at + [0, 0, height], faces)).delta[0, 0]
-        assert pressed == pytest.approx(most, rel=bound)
+        assert pressed == approx(most, rel=bound)
 
 
 def test_one_vertex_comes_near(pad: cs.Simulator) -> None:
@@ -185,9 +186,9 @@ def test_what_hangs_beside_or_behind_stays_there() -> None:
 
     over, beside = heights(np.where(np.abs(vertices[:, 0]) < 0.012, -1e-3, -5e-3))
     assert (over == 0.0).all()
-    assert beside.min() == pytest.approx(-5e-3)
+    assert beside.min() == approx(-5e-3)
     over, _ = heights(np.where(vertices[:, 0] < 0.0, 1e-3, -0.02))
-    assert over.min() == pytest.approx(-0.02)
+    assert over.min() == approx(-0.02)
 
 
 def test_slopes_of_meshes_are_smooth(pad: cs.Simulator) -> None:

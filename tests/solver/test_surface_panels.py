@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from approximate import approx
 
 from capsense.errors import SceneError
 from capsense.scene.mesh_shape import TriMesh
@@ -63,7 +64,7 @@ def test_primitives(shape, count):
     vector = panels.areas[:, None] * panels.normals
     assert np.abs(vector.sum(axis=0)).max() < 1e-12 * panels.areas.sum()
     volume = np.einsum("ij,ij->", panels.centers, vector) / 3
-    assert volume == pytest.approx(shape.volume, rel=1e-9 if isinstance(shape, Box) else 6e-3)
+    assert volume == approx(shape.volume, rel=1e-9 if isinstance(shape, Box) else 6e-3)
     again = panels_of(shape, count)
     np.testing.assert_array_equal(again.corners, panels.corners)
 
@@ -80,7 +81,7 @@ def test_primitives(shape, count):
 )
 def test_areas(shape, area):
     """Flat panels at the right mean distance have slightly more than the curved area."""
-    assert panels_of(shape).areas.sum() == pytest.approx(area, rel=6e-3)
+    assert panels_of(shape).areas.sum() == approx(area, rel=6e-3)
 
 
 @pytest.mark.parametrize(
@@ -91,8 +92,8 @@ def test_areas(shape, area):
 def test_thickness(shape, thickness, limit):
     """Analytic: twice the volume over the area, also of a shape twice as large; none if open."""
     panels = panels_of(shape)
-    assert panels.thickness == pytest.approx(thickness, rel=limit)
-    assert panels.scaled(2.0).thickness == pytest.approx(2 * thickness, rel=limit)
+    assert panels.thickness == approx(thickness, rel=limit)
+    assert panels.scaled(2.0).thickness == approx(2 * thickness, rel=limit)
     assert panels_of(SQUARE, 20).thickness == np.inf
 
 
@@ -168,12 +169,12 @@ def test_a_box_of_twelve_triangles_is_halved_and_a_fine_ball_reduced():
     check(panels)
     assert panels.closed
     assert len(panels) == 600
-    assert panels.areas.sum() == pytest.approx(6.0, rel=1e-12)
+    assert panels.areas.sum() == approx(6.0, rel=1e-12)
     panels = panels_of(ball(4), 500)
     check(panels)
     assert panels.closed
     assert 500 <= len(panels) <= 625
-    assert panels.areas.sum() == pytest.approx(4 * np.pi, rel=4e-3)
+    assert panels.areas.sum() == approx(4 * np.pi, rel=4e-3)
     np.testing.assert_array_equal(panels_of(ball(4), 500).corners, panels.corners)
 
 
@@ -189,7 +190,7 @@ def test_any_winding_copies_and_degenerate_triangles():
     check(panels)
     assert panels.closed
     assert np.einsum("ij,ij->i", panels.normals, panels.centers).min() > 0.9
-    assert panels.areas.sum() == pytest.approx(
+    assert panels.areas.sum() == approx(
         np.linalg.norm(
             np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
         ).sum()
@@ -203,16 +204,16 @@ def test_open_and_doubled_sheets():
     once = panels_of(SQUARE)
     check(once)
     assert not once.closed
-    assert once.areas.sum() == pytest.approx(1.0, rel=1e-12)
+    assert once.areas.sum() == approx(1.0, rel=1e-12)
     both = panels_of(np.concatenate([SQUARE, SQUARE[:, ::-1]]))
     assert not both.closed
-    assert both.areas.sum() == pytest.approx(1.0, rel=1e-12)
+    assert both.areas.sum() == approx(1.0, rel=1e-12)
 
 
 def test_panels_that_nearly_coincide_count_once():
     """Two copies of a sheet, a hundred-thousandth of its size apart."""
     copy = SQUARE + np.array([0.0, 0.0, 1e-5])
-    assert panels_of(np.concatenate([SQUARE, copy])).areas.sum() == pytest.approx(1.0, rel=1e-9)
+    assert panels_of(np.concatenate([SQUARE, copy])).areas.sum() == approx(1.0, rel=1e-9)
 
 
 def test_parts_keep_their_share():

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from approximate import approx
 from scipy.optimize import lsq_linear
 
 import capsense as cs
@@ -29,7 +30,7 @@ def test_distance_of_segments() -> None:
         ways = np.stack([first[1] - first[0], second[0] - second[1]], axis=1)
         best = lsq_linear(ways, second[0] - first[0], (0, 1), tol=1e-14)
         apart = math.sqrt(2 * best.cost)
-        assert segment_distance(first, second) == pytest.approx(apart, abs=2e-4)
+        assert segment_distance(first, second) == approx(apart, abs=2e-4)
         assert segment_distance(first, second) <= apart + 1e-9
 
 

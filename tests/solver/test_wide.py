@@ -9,6 +9,7 @@ from copy import copy
 
 import numpy as np
 import pytest
+from approximate import approx
 from one_skin import person
 from reference_scenes import DESIGN, MORE, diagonal_errors, reference_scenes
 from scipy.spatial import cKDTree
@@ -292,8 +293,8 @@ def test_triangles_of_wide_meshes_are_not_merged():
     mesh = cs.Ellipsoid((0.2, 0.15, 0.15)).to_trimesh()
     shape = cs.TriMesh(mesh.vertices, mesh.faces)
     panels = panels_of(shape, 500, merge=False)
-    assert len(panels) == pytest.approx(500 + len(mesh.faces), rel=0.1)
-    assert panels.areas.sum() == pytest.approx(mesh.area, rel=1e-9)
+    assert len(panels) == approx(500 + len(mesh.faces), rel=0.1)
+    assert panels.areas.sum() == approx(mesh.area, rel=1e-9)
     assert panels.closed
 
 
@@ -302,8 +303,8 @@ def test_what_is_kept_of_a_shape():
     first, size = store.in_pieces(cs.Box((0.4, 0.3, 0.2)), 5000, True)
     second, other = store.in_pieces(cs.Box((0.8, 0.6, 0.4)), 5000, True)
     assert first is second
-    assert other == pytest.approx(2 * size)
-    assert first.radius * size == pytest.approx(math.hypot(0.2, 0.15, 0.1), rel=0.1)
+    assert other == approx(2 * size)
+    assert first.radius * size == approx(math.hypot(0.2, 0.15, 0.1), rel=0.1)
     assert first.radius * size >= math.hypot(0.2, 0.15, 0.1)
     panels = panels_of(cs.Box((0.4, 0.3, 0.2)), 5000)
     assert FinePanelBody(panels, lambda: panels).record["n"] == len(panels) == first.record["n"]
@@ -571,7 +572,7 @@ def test_a_person_of_one_skin(simulators, preset, open_skin, most):
     much here, and many times as much on meshes of capsules that were united."""
     sim, scene = simulators("six_patch", preset=preset), person(open_skin)
     found = sim.step(scene)
-    assert of_skin(found.delta) == pytest.approx(SKIN, rel=most)
+    assert of_skin(found.delta) == approx(SKIN, rel=most)
     assert found.stats.unknowns < (150 if preset == "standard" else 300)
 
 
@@ -581,7 +582,7 @@ def test_the_reference_of_one_skin(simulators, open_skin):
     """Differential: many panels that have energies of their own."""
     sim, many = simulators("six_patch"), Preset(panels=5500, threshold=5e-4, coarsest=None)
     truth = SurfaceSolver(sim.background.green, sim.design, preset=many).solve(person(open_skin))
-    assert of_skin(truth.matrix) == pytest.approx(SKIN, rel=1e-3)
+    assert of_skin(truth.matrix) == approx(SKIN, rel=1e-3)
 
 
 def test_weights_of_functions():
@@ -617,8 +618,8 @@ def test_means_of_large_clusters():
         for shape in (cs.Sphere(0.1), PLATE)
     )
     few = free_block(panels_of(PLATE, 1000))
-    assert means_of(ball)[0, 0] == pytest.approx(10.0, rel=2e-3)
-    assert means_of(plate)[0, 0] == pytest.approx(1 / equilibrium(few).sum(), rel=0.01)
+    assert means_of(ball)[0, 0] == approx(10.0, rel=2e-3)
+    assert means_of(plate)[0, 0] == approx(1 / equilibrium(few).sum(), rel=0.01)
     for body in (ball, plate):
         means = means_of(body)
         children, charge = (

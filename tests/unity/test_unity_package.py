@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 
 pytest.importorskip("websockets", reason='needs websockets: pip install "capsense[serve]"')
 
@@ -92,8 +93,8 @@ def test_frames_out_readings_back(program: Path, served: RunningServer) -> None:
         here = simulator.step(cs.DepthFrame(np.where(np.isfinite(depth), depth, 0), "steel"))
         assert line["time"] == 0.01 * k
         # The depths agree to a few units of float32.
-        assert matrix(line["delta"]) == pytest.approx(here.delta, rel=1e-4)
-        assert line["self"] == pytest.approx(here.self_capacitance, rel=1e-6)
+        assert matrix(line["delta"]) == approx(here.delta, rel=1e-4)
+        assert line["self"] == approx(here.self_capacitance, rel=1e-6)
         assert np.array_equal(matrix(line["baseline"]), simulator.baseline)
         assert tuple(line["electrodes"]) == simulator.electrode_names
         assert (line["channels"], line["codes"], line["dropped"]) == ([], [], 0)
@@ -107,7 +108,7 @@ def test_permittivity_codes(program: Path, served: RunningServer) -> None:
     depth = moving_depth(0).depth[0].astype(np.float32)
     codes = np.where(np.arange(64 * 64) < 2048, 4, 255).astype(np.uint8).reshape(64, 64)
     here = Simulator("six_patch").step(cs.DepthFrame(depth, codes, back=0.05)).delta
-    assert matrix(line["delta"]) == pytest.approx(here, rel=1e-4)
+    assert matrix(line["delta"]) == approx(here, rel=1e-4)
 
 
 @needs_mono
@@ -175,7 +176,7 @@ def test_component(program: Path, served: RunningServer, depth_buffer: str) -> N
     codes = np.where(x > -0.06, 3, 9).astype(np.uint8)
     here = Simulator("six_patch").step(cs.DepthFrame(np.where(box, 0.06, 0.0), codes)).delta
     assert np.argmax(np.diag(matrix(first["delta"]))) == 3
-    assert matrix(first["delta"]) == pytest.approx(here, rel=1e-3)
+    assert matrix(first["delta"]) == approx(here, rel=1e-3)
     assert first["received"] == 3
     assert 0 < first["time"] < 0.5 * TIMEOUT
     assert last == {"state": "Stopped"}
@@ -226,7 +227,7 @@ def test_sample(program: Path, served: RunningServer) -> None:
     assert tuple(line["names"]) == Simulator("six_patch").electrode_names
     own = np.diag(matrix(line["delta"]))
     assert own.min() > 1e-15
-    assert line["heights"] == pytest.approx(np.maximum(own / 1e-12, 0.001), rel=1e-6)
+    assert line["heights"] == approx(np.maximum(own / 1e-12, 0.001), rel=1e-6)
 
 
 json_values = st.recursive(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from approximate import approx
 from PIL import Image
 
 pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
@@ -41,7 +42,7 @@ def test_the_robot_in_mujoco() -> None:
         until(lambda: page.player.newest is not None and page.player.newest.index == 9)
         frame = page.player.newest
         assert frame is not None
-        assert frame.time == pytest.approx(data.time)
+        assert frame.time == approx(data.time)
         (carrier, at), (limb, there) = frame.around
         assert isinstance(carrier, cs.Box)
         np.testing.assert_allclose(at.position, (0, 0, -0.006), atol=1e-12)

@@ -175,17 +175,19 @@ class Terminals:
 
     Args:
         design: The design.
-        rest: Maxwell matrix of all terminals in the empty domain [F], shape (t, t).
+        empty_maxwell: Maxwell matrix of all terminals in the empty domain [F], shape (t, t).
     """
 
-    def __init__(self, design: Design, rest: Array) -> None:
+    def __init__(self, design: Design, empty_maxwell: Array) -> None:
         self.electrodes = len(design.electrodes)
-        self.driven = len(rest) - sum(c.role == Role.FLOATING for c in design.conductors)
+        self.driven = len(empty_maxwell) - sum(c.role == Role.FLOATING for c in design.conductors)
         """How many electrodes there are, n, and how many terminals are driven, k."""
-        self.rest = rest
-        self.empty: Array = self._without_floating(rest)
+        self.empty_maxwell = empty_maxwell
+        self.empty: Array = self._without_floating(empty_maxwell)
         """Maxwell matrix of the driven terminals in the empty domain [F], shape (k, k)."""
-        self.bound: Array = np.maximum(-rest, 0.0)  # coarse meshes may have them the other way
+        self.bound: Array = np.maximum(
+            -empty_maxwell, 0.0
+        )  # coarse meshes may have them the other way
         """Most that each entry changes by [F], shape (t, t): terminals that are screened from each
         other do not couple."""
         np.fill_diagonal(self.bound, np.inf)
@@ -196,14 +198,14 @@ class Terminals:
 
     def grounded(self, change: Array) -> Array:
         """Raise diagonals of a change so far that no capacitance to ground is negative, (t, t)."""
-        lack = np.minimum((self.rest + change).sum(axis=1), 0.0)
+        lack = np.minimum((self.empty_maxwell + change).sum(axis=1), 0.0)
         return change - np.diag(lack)
 
     def change(self, change: NDArray[Any]) -> NDArray[Any]:
         """Change of the driven terminals' matrix by that of all, (..., t, t) -> (..., k, k)."""
-        if self.driven == len(self.rest):
+        if self.driven == len(self.empty_maxwell):
             return change
-        return self._without_floating(self.rest + change) - self.empty
+        return self._without_floating(self.empty_maxwell + change) - self.empty
 
     def slope(self, change: NDArray[Any], slope: Array) -> Array:
         """Derivative of the electrodes' matrix by that of all terminals.
@@ -216,10 +218,10 @@ class Terminals:
             Shape (..., b, n, n, 6).
         """
         n = self.electrodes
-        if self.driven == len(self.rest):
+        if self.driven == len(self.empty_maxwell):
             return slope[..., :n, :n, :]
-        own, cross = self._floating(self.rest + change)
-        follow = np.zeros((*change.shape[:-2], len(self.rest), n), change.dtype)
+        own, cross = self._floating(self.empty_maxwell + change)
+        follow = np.zeros((*change.shape[:-2], len(self.empty_maxwell), n), change.dtype)
         follow[..., :n, :] = np.eye(n)
         follow[..., self.driven :, :] = -np.linalg.solve(own, cross[..., :n])
         return np.einsum("...ai,...bacm,...cj->...bijm", follow, slope, follow)
@@ -231,7 +233,7 @@ class Terminals:
 
     def _without_floating(self, matrix: NDArray[Any]) -> NDArray[Any]:
         k = self.driven
-        if k == len(self.rest):
+        if k == len(self.empty_maxwell):
             return matrix
         own, cross = self._floating(matrix)
         return matrix[..., :k, :k] - cross.swapaxes(-1, -2) @ np.linalg.solve(own, cross)

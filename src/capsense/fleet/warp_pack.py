@@ -56,7 +56,7 @@ def pack_circuit(solver: SurfaceSolver, terminals: Terminals, device: Any) -> An
     out = network.Circuit()
     out.electrodes, out.driven = terminals.electrodes, terminals.driven
     out.unit, out.metre = solver.unit, UNIT
-    for name in ("rest", "empty"):
+    for name in ("empty_maxwell", "empty"):
         setattr(out, name, wp.array(getattr(terminals, name), dtype=wp.float64, device=device))
     bound = np.minimum(terminals.bound, np.finfo(np.float32).max).astype(np.float32)
     out.screened = wp.array(bound, dtype=wp.float32, device=device)
