@@ -127,7 +127,7 @@ def test_scenes_without_a_solution(
         return delta, error, size
 
     monkeypatch.setattr(solver, "solve_each", broken)
-    with pytest.raises(BatchError, match="look for bodies that coincide") as caught:
+    with pytest.raises(BatchError, match="do two bodies coincide") as caught:
         tiny.step_batch(views, threads=threads)
     failures = caught.value.failures
     assert len(failures) >= min(2, threads)

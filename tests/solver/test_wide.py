@@ -177,7 +177,7 @@ def test_fleets_read_as_simulators():
     where[..., 6] = 1.0
     where[:, 0, :3], where[:, 1, :3] = (0.01, 0.0, 0.12), (0.02, 0.0, 0.06)
     found = fleet.step(where).delta[:, 0]
-    simulator = cs.Simulator("six_patch", preset="fast")
+    simulator = cs.Simulator("six_patch")
     for e in range(3):
         placed = zip((others[e], finger), where[e], strict=True)
         scene = cs.Scene([body.moved(cs.Pose(at[:3])) for body, at in placed])
