@@ -88,7 +88,7 @@ class WarpCore:
                 "charge on residual": (n, 2 * phi_columns, views),
                 "sums": (width - self.green.first, 2 * phi_columns, views),
                 "strength": (len(self.green.sources), 2 * phi_columns, views),
-                "potential_coefficients": (n, views),
+                "energy": (n, views),
                 "doubt": (size, views),
                 "dropped": (views,),
                 "below": (size, size, views),
