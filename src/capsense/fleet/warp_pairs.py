@@ -46,8 +46,8 @@ class Leaf:
     unlifted: four  # the same before they were lifted off the design
     lifted: wp.int32
     extent: wp.float32
-    soft: wp.float32
-    beyond: wp.float32
+    softening_length: wp.float32
+    outside_fraction: wp.float32
     near: wp.float32
 
 
