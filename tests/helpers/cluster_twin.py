@@ -136,7 +136,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         leaves = placed(bodies, cut, green)
         rows = leaf_rows(leaves.points, leaves.outside_fraction, green)
         functions = functions_of(bodies, cut, leaves.outside_fraction)
-        inside = leaves._replace(beyond=np.zeros_like(leaves.outside_fraction))
+        inside = leaves._replace(outside_fraction=np.zeros_like(leaves.outside_fraction))
         pairs = leaf_pairs(inside, green.floor)
         bound_images(leaves, rows, pairs, green)
         system = assembled(bodies, cut, functions, rows, pairs, green.phi_columns)
