@@ -234,7 +234,9 @@ def _plain(value: Any) -> Any:
         return value.tolist() if isinstance(value, np.ndarray) else value.value
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
-    return dict(value) if isinstance(value, Mapping) else value
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return value
 
 
 def _read(kind: Any, data: Any) -> Any:
@@ -251,6 +253,9 @@ def _read(kind: Any, data: Any) -> Any:
     if get_origin(kind) is tuple:
         of = get_args(kind)[0]
         return tuple(_read(of, item) for item in data)
+    if get_origin(kind) is Mapping:
+        of = get_args(kind)[1]
+        return {key: _read(of, item) for key, item in data.items()}
     if get_origin(kind) is np.ndarray:
         array = np.array(data)
         return array if array.size else array.reshape(-1, 2, 3)  # a surface without rims

@@ -24,6 +24,7 @@ def warmup(args: argparse.Namespace) -> int:
 
     examples:
       capsense warmup
+      capsense warmup --quiet
     """
     logging.getLogger("capsense").setLevel(logging.ERROR)  # what is announced is what is done
     start = perf_counter()

@@ -203,7 +203,7 @@ def warn_of_doubt(scene: Scene, electrode: tuple[str, Array], share: float, reas
         for k, body in enumerate(scene)
         if body.shape.kind != ShapeKind.LAYERS
     }
-    what = min(near, key=lambda body: near[body]) if near else "what the camera sees"
+    what = min(near, key=lambda body: near[body]) if near else "the camera sees"
     far = f", {1e3 * max(near[what], 0.0):.2g} mm away," if near else ""
     warnings.warn(
         f"the estimated error of electrode {name} is {share:.0%} of what {what}{far} changes"
