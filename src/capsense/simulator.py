@@ -259,7 +259,7 @@ class Simulator:
             time: Time of the scene [s], not before that of the last step; a readout needs it, and
                 the relaxation and hysteresis of a cover follow it: without it there are none.
             jacobian: Whether to work out ``reading.jacobian`` as well; it adds about 50 % to the
-            step.
+                step.
             keep_field: Whether the reading keeps what ``reading.potentials`` and
                 ``reading.charges`` work with, of some megabytes.
 
@@ -274,9 +274,7 @@ class Simulator:
         if self.readout is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(scene, time=…), in seconds")
         with self._one:
-            reading = self._of(*self._found(scene, time, jacobian, keep_field))
-            if keep_field:
-                reading = reading.with_field(self._solver.field())
+            reading = self._read(scene, time, jacobian, keep_field)
             if self.readout is None or time is None:
                 return reading
             return replace(reading, counts=self.readout.sample(time, reading))
@@ -292,13 +290,12 @@ class Simulator:
         """As :meth:`step`, without the readout, which is left as it is."""
         check_view("step takes", scene)
         with self._one:
-            reading = self._of(*self._found(scene, time, jacobian, keep_field))
-            return reading.with_field(self._solver.field()) if keep_field else reading
+            return self._read(scene, time, jacobian, keep_field)
 
-    def _found(
+    def _read(
         self, scene: Scene | DepthFrame, time: float | None, jacobian: bool, keep_field: bool
-    ) -> tuple[CapacitanceChange, Scene, float]:
-        """What the solver finds, of which scene, and the time that it took [s]."""
+    ) -> Reading:
+        """Solve a scene; see :meth:`step`."""
         start = perf_counter()
         if jacobian and self.method == "fem_masked":
             raise ValueError('method "fem_masked" has no Jacobian; use "surface"')
@@ -308,7 +305,8 @@ class Simulator:
             scene = scene.scene()
         self.steps += 1
         found = self._solver.solve(scene, jacobian=jacobian, time=time)
-        return found, scene, perf_counter() - start
+        reading = self._of(found, scene, perf_counter() - start)
+        return reading.with_field(self._solver.field()) if keep_field else reading
 
     def _of(self, found: CapacitanceChange, scene: Scene, seconds: float) -> Reading:
         """The reading that a solver's result makes, which took some time [s]."""

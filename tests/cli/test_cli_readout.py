@@ -12,7 +12,6 @@ import pytest
 from approximate import approx
 from ball_scenario import ball_scenario
 from maxwell import random_maxwell
-from relative import near
 
 from capsense.__main__ import main
 from capsense.cli import BAD_INPUT, OK
@@ -118,8 +117,8 @@ def test_driven_shields_are_read_from_a_matrix_recording(run):
     np.savez(folder / "readings.npz", **arrays)
     recording = load_recording(folder)
     driven = ChannelBank(self_patterns(recording.electrodes), recording.electrodes)
-    assert recording.channels(driven) == near(arrays["self_capacitance"], rel=1e-12)
-    assert recording.empty_channels(driven) == near(arrays["self_baseline"], rel=1e-12)
+    assert recording.channels(driven) == approx(arrays["self_capacitance"], rel=1e-12)
+    assert recording.empty_channels(driven) == approx(arrays["self_baseline"], rel=1e-12)
     summary = json.loads((folder / "summary.json").read_text("utf-8"))
     (folder / "summary.json").write_text(json.dumps({**summary, "shields": 1}), "utf-8")
     table = load_recording(folder / "readings.csv")
@@ -127,7 +126,7 @@ def test_driven_shields_are_read_from_a_matrix_recording(run):
         table.channels(driven)
     still = ChannelBank(self_patterns(recording.electrodes, shield=0.0), recording.electrodes)
     diagonal = np.diagonal(arrays["capacitance"], axis1=1, axis2=2)
-    assert table.channels(still) == near(diagonal, rel=1e-9)
+    assert table.channels(still) == approx(diagonal, rel=1e-9)
 
 
 def test_all_chips_write_and_draw(run, tmp_path, capsys):

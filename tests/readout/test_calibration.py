@@ -7,7 +7,6 @@ import warnings
 import numpy as np
 import pytest
 from approximate import approx
-from relative import near
 from scipy import stats
 
 from capsense.errors import ReadoutError
@@ -48,9 +47,9 @@ def test_figures_are_found():
     """Analytic: without noise, gain, offset and drift come out, with no uncertainty to speak of."""
     true, measured, time = recording(np.random.default_rng(0))
     fit = calibrate(true, measured, time)
-    assert fit.gain == near(GAIN, rel=1e-9)
-    assert fit.offset == near(OFFSET, rel=1e-6)
-    assert fit.drift == near(DRIFT, rel=1e-6)
+    assert fit.gain == approx(GAIN, rel=1e-9)
+    assert fit.offset == approx(OFFSET, rel=1e-6)
+    assert fit.drift == approx(DRIFT, rel=1e-6)
     assert (fit.residual < 1e-24).all()
     assert np.abs(fit.correct(measured, time) - true).max() < 1e-23
     assert np.abs(fit.distort(true, time) - measured).max() < 1e-23
@@ -62,9 +61,9 @@ def test_channels_with_instants_of_their_own():
     instants = time[:, None] + [0.0, 0.2]
     measured = GAIN * true + OFFSET + DRIFT * (instants - 50)
     fit = calibrate(true, measured, instants, floor=1e-18)
-    assert fit.epoch == near(50.1, rel=1e-12)
-    assert fit.offset == near(OFFSET + 0.1 * DRIFT, rel=1e-6)
-    assert fit.drift == near(DRIFT, rel=1e-6)
+    assert fit.epoch == approx(50.1, rel=1e-12)
+    assert fit.offset == approx(OFFSET + 0.1 * DRIFT, rel=1e-6)
+    assert fit.drift == approx(DRIFT, rel=1e-6)
     assert np.abs(fit.correct(measured, instants) - true).max() < 1e-23
     assert np.abs(fit.distort(true, instants) - measured).max() < 1e-23
 
@@ -86,7 +85,7 @@ def test_small_changes_on_a_large_base():
     time = np.linspace(0, 100, 200)
     true = 5e-12 * (1 + 1e-5 * np.random.default_rng(0).uniform(0, 1, (200, 1)))
     fit = calibrate(true, 1.02 * true + 3e-13, time)
-    assert fit.gain == near([1.02], rel=1e-9)
+    assert fit.gain == approx([1.02], rel=1e-9)
     assert fit.drift == approx([0.0], abs=1e-27)
 
 
@@ -147,7 +146,7 @@ def test_a_sensor_that_is_not_linear_is_doubted():
 def test_without_drift():
     true, measured, _ = recording(np.random.default_rng(0))
     fit = calibrate(true, GAIN * true + OFFSET, drift=False)
-    assert fit.gain == near(GAIN, rel=1e-9)
+    assert fit.gain == approx(GAIN, rel=1e-9)
     assert (fit.drift == 0).all()
     assert (fit.uncertainty[:, 2] == 0).all()
     assert np.abs(fit.correct(fit.distort(true)) - true).max() < 1e-23
@@ -210,12 +209,12 @@ def test_flicker_covariance_is_its_definition():
     matrix = variance * sum(np.exp(-lag / tau) for tau in taus)
     found, trace = flicker_covariance(columns, time, 1e-15)
     assert found == approx(matrix @ columns, rel=1e-9, abs=1e-42)
-    assert trace == near(np.trace(matrix), rel=1e-12)
+    assert trace == approx(np.trace(matrix), rel=1e-12)
 
 
 def test_residual_is_the_noise():
     fit = calibrate(*recording(np.random.default_rng(2), 5000, 2e-15))
-    assert fit.residual == near(np.full(2, 2e-15), rel=0.05)
+    assert fit.residual == approx(np.full(2, 2e-15), rel=0.05)
     assert fit.samples.tolist() == [5000, 5000]
 
 
@@ -235,7 +234,7 @@ def test_a_calibrated_model_measures_like_the_sensor():
     assert np.abs(again.gain - GAIN).max() < 5 * again.uncertainty[:, 0].max()
     drift_between = DRIFT * (again.epoch - sensor.epoch)
     assert again.offset == approx(OFFSET + drift_between, abs=5e-17)
-    assert again.drift == near(DRIFT, rel=0.05)
+    assert again.drift == approx(DRIFT, rel=0.05)
     with pytest.raises(ReadoutError, match="list of 3, one per channel"):
         Readout(
             ChannelBank(self_patterns("ABC"), tuple("ABC")), Schedule.simultaneous(3, 0.1),
@@ -247,10 +246,10 @@ def test_normalisations():
     """Analytic: base, tare, relative and unit range."""
     empty = np.array([[1e-12, 2e-12], [3e-12, 2e-12]])
     base = base_capacitance(empty)
-    assert base == near([2e-12, 2e-12], rel=1e-12)
+    assert base == approx([2e-12, 2e-12], rel=1e-12)
     values = np.array([[2e-12, 1e-12], [4e-12, 3e-12]])
     assert tare(values, base) == approx(np.array([[0, -1e-12], [2e-12, 1e-12]]), abs=1e-24)
-    assert relative_to(values, base) == near(np.array([[1, 0.5], [2, 1.5]]), rel=1e-12)
+    assert relative_to(values, base) == approx(np.array([[1, 0.5], [2, 1.5]]), rel=1e-12)
     assert unit_range(values).tolist() == [[0, 0], [1, 1]]
 
 
@@ -258,9 +257,9 @@ def test_cross_correlation():
     """Differential: Pearson's coefficient; insensitive to gain and offset."""
     rng = np.random.default_rng(4)
     a, b = rng.standard_normal((2, 300))
-    assert cross_correlation(a, b) == near(np.corrcoef(a, b)[0, 1], rel=1e-9)
-    assert cross_correlation(a, 3e-15 * a + 1e-12) == near(1.0, rel=1e-6)
-    assert cross_correlation(a, -a) == near(-1.0, rel=1e-12)
+    assert cross_correlation(a, b) == approx(np.corrcoef(a, b)[0, 1], rel=1e-9)
+    assert cross_correlation(a, 3e-15 * a + 1e-12) == approx(1.0, rel=1e-6)
+    assert cross_correlation(a, -a) == approx(-1.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("drift", [False, True])
@@ -269,7 +268,7 @@ def test_one_sample_more_than_unknowns_is_enough(drift):
     count = 4 if drift else 3
     true, time = np.array([[1.0], [3.0], [2.0], [5.0]])[:count], np.arange(count)
     fit = calibrate(true, 2.0 * true + 0.5, time, drift=drift)
-    assert fit.gain == near(2.0, rel=1e-9)
+    assert fit.gain == approx(2.0, rel=1e-9)
     assert fit.samples == count
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from approximate import approx
 from maxwell import random_maxwell
-from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
@@ -60,7 +60,7 @@ def test_patterns_against_the_whole_circuit(pattern):
     matrices = np.array([random_maxwell(rng, 5) for _ in range(20)])
     found = ChannelBank([pattern], NAMES).values(matrices)
     expected = [[measured(c, pattern)] for c in matrices]
-    assert found == near(np.array(expected), rel=1e-12)
+    assert found == approx(np.array(expected), rel=1e-12)
 
 
 def test_batches_and_single_matrices_agree_to_the_bit():
@@ -86,7 +86,7 @@ def test_shields_follow_the_transmitter():
         reference = measured(whole @ turned, Pattern("A", rest=rest, floating=(*floating,)), names)
         if rest == "guard":
             reference = measured(whole, Pattern("A", rest="guard"), names)
-        assert found[0] == near(reference, rel=1e-12)
+        assert found[0] == approx(reference, rel=1e-12)
 
 
 def test_reciprocity():
@@ -96,7 +96,7 @@ def test_reciprocity():
     for rest in ("grounded", "floating"):
         there = ChannelBank([Pattern("B", {"A": 1.0}, rest=rest)], NAMES).values(matrix)
         back = ChannelBank([Pattern("A", {"B": 1.0}, rest=rest)], NAMES).values(matrix)
-        assert there == near(back, rel=1e-12)
+        assert there == approx(back, rel=1e-12)
 
 
 def test_families():
@@ -106,7 +106,7 @@ def test_families():
     guarded = ChannelBank(self_patterns(NAMES, rest="guard"), NAMES).values(matrix)
     alone = matrix.sum(axis=1)
     # A guarded electrode sees ground only: its row's sum.
-    assert guarded == near(alone, rel=1e-12)
+    assert guarded == approx(alone, rel=1e-12)
     bank = ChannelBank(mutual_patterns(NAMES), NAMES)
     assert (bank.values(matrix) == -matrix[np.triu_indices(5, 1)]).all()
     assert bank.names[:2] == ("A-B", "A-C")

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from approximate import approx
-from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout import Readout
@@ -52,7 +51,7 @@ def test_noise_is_as_stated(chip, rate):
         step = 0.0 if chip.name == "fdc2214" else step
     expected = math.sqrt(rate.rms**2 + (chip.relative_noise * LEVEL) ** 2 + step**2 / 12)
     deviation = counts.capacitance.std()
-    assert deviation == near(expected, rel=5 / math.sqrt(2 * len(counts)) + 0.02)
+    assert deviation == approx(expected, rel=5 / math.sqrt(2 * len(counts)) + 0.02)
     assert counts.code.dtype == np.int64
 
 
@@ -70,7 +69,7 @@ def test_allan_deviation_is_as_specified(chip):
     lsb = readout.law.capacitance(code) - readout.law.capacitance(code + 1)
     variance = chip.rates[0].rms ** 2 + (chip.relative_noise * LEVEL) ** 2 + lsb**2 / 12
     expected = np.hypot(np.sqrt(variance / averages), chip.flicker)
-    assert measured == near(expected, rel=0.1)
+    assert measured == approx(expected, rel=0.1)
 
 
 def test_noise_off_leaves_rounding():
@@ -85,17 +84,17 @@ def test_noise_off_leaves_rounding():
 def test_confirmed_figures():
     """The figures as their sources state them."""
     fdc = CHIPS["fdc1004"]
-    assert fdc.law.level(np.array(1e-12)) == near(2.0**19, rel=1e-12)
+    assert fdc.law.level(np.array(1e-12)) == approx(2.0**19, rel=1e-12)
     assert [r.per_second for r in fdc.rates] == [100.0, 200.0, 400.0]
-    assert fdc.dac.step * 32 == near(100e-12, rel=1e-12)
+    assert fdc.dac.step * 32 == approx(100e-12, rel=1e-12)
     plan = schedule_of(CHIPS["ad7147"], [None] * 12, 1 / CHIPS["ad7147"].rates[0].per_second)
-    assert plan.period == near(9.216e-3, rel=1e-9)
+    assert plan.period == approx(9.216e-3, rel=1e-9)
     ad = CHIPS["ad7746"].law
     assert ad.level(np.array(0.0)) == 0x800000
-    assert ad.capacitance(np.array(2**24)) == near(4.096e-12, rel=1e-12)
+    assert ad.capacitance(np.array(2**24)) == approx(4.096e-12, rel=1e-12)
     rates = [round(r.per_second) for r in CHIPS["ad7746"].rates]
     assert rates == [91, 84, 50, 26, 16, 13, 11, 9]
-    assert CHIPS["teensy"].law.level(np.array(1e-12)) == near(50.0, rel=1e-12)
+    assert CHIPS["teensy"].law.level(np.array(1e-12)) == approx(50.0, rel=1e-12)
     # The FDC1004's inputs in turn, two chips side by side for six electrodes.
     plan = schedule_of(fdc, [None] * 6, 1 / 400)
     assert plan.slots == ((0, 4), (1, 5), (2,), (3,))
@@ -106,14 +105,14 @@ def test_rates_are_conversions_per_second():
     for chip, rate in RATES:
         readout = Readout.preset(chip.name, NAMES[:2], rate=rate.per_second, expected=LEVEL)
         slots = len(readout.schedule.slots)
-        assert slots / readout.schedule.period == near(rate.per_second, rel=1e-9)
+        assert slots / readout.schedule.period == approx(rate.per_second, rel=1e-9)
 
 
 def test_dac_jump_of_the_fdc1004():
     """Measured: 18.9 pF read with CAPDAC code 7 and 8 differ by the specimen's 1.38 pF."""
     actual = CHIPS["fdc1004"].dac.actual()
     jump = (8 * 3.125e-12 - actual[8]) - (7 * 3.125e-12 - actual[7])
-    assert jump == near(-1.38e-12, rel=0.01)
+    assert jump == approx(-1.38e-12, rel=0.01)
 
 
 def test_offset_dac_as_the_host_sets_it():
@@ -151,7 +150,7 @@ def test_charge_set_up():
         assert 1e-6 <= law.current <= 63e-6  # what the chip's registers hold
         assert 0.5e-6 <= law.time <= 32e-6
         if 10e-12 < capacitance < 800e-12:
-            assert code == near(law.low + 0.9 * (law.high - law.low), rel=0.05)
+            assert code == approx(law.low + 0.9 * (law.high - law.low), rel=0.05)
     with pytest.raises(ReadoutError, match="outside of what an MPR121 can charge"):
         CHIPS["mpr121"].law.set_for(1e-14)
 
@@ -190,7 +189,7 @@ def test_leads_load_the_shunt():
     level = 0.1e-12
     found = readout([0.0, 0.1], np.full((2, 1), level)).capacitance[0]
     expected = level / math.hypot(1, 2 * math.pi * 1e6 * 1e3 * 30e-12)
-    assert found == near(expected, rel=3e-3)
+    assert found == approx(expected, rel=3e-3)
 
 
 def test_drift_with_temperature():
@@ -216,15 +215,15 @@ def test_pace_and_latency_of_the_host():
     """A chip that is asked every 50 ms, and answers 4 ms later."""
     readout = Readout.preset("fdc1004", NAMES[:2], period=0.05, latency=4e-3)
     counts = readout([0.0, 0.25], np.full((2, 2), LEVEL))
-    assert counts.of("E0").time == near(0.014 + 0.05 * np.arange(5), rel=1e-9)
-    assert counts.of("E1").time == near(0.024 + 0.05 * np.arange(5), rel=1e-9)
+    assert counts.of("E0").time == approx(0.014 + 0.05 * np.arange(5), rel=1e-9)
+    assert counts.of("E1").time == approx(0.024 + 0.05 * np.arange(5), rel=1e-9)
 
 
 def test_noise_of_ones_own():
     """Statistical: white noise given takes the place of the chip's, in every chip."""
     for name in ("ad7746", "mpr121", "teensy"):
         readout, counts = still(name, 40, white=5e-13 if name == "teensy" else 5e-14, flicker=0.0)
-        assert counts.capacitance.std() == near(readout.stages[0].rms, rel=0.1)
+        assert counts.capacitance.std() == approx(readout.stages[0].rms, rel=0.1)
         quiet, _ = still(name, 1, white=0.0, flicker=0.0)
         assert quiet.stages == ()
 
@@ -265,4 +264,4 @@ def test_a_sensor_without_pairs_is_refused():
 
 def test_options_and_presets_are_one():
     readout = build_chip("FDC1004", NAMES, ReadoutOptions(rate=400))
-    assert readout.schedule.conversion == near(2.5e-3, rel=1e-12)
+    assert readout.schedule.conversion == approx(2.5e-3, rel=1e-12)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from relative import near
+from approximate import approx
 
 from capsense.errors import ReadoutError
 from capsense.readout import Readout
@@ -78,7 +78,7 @@ def test_everything_is_taken_over():
     readout = parse(FULL)
     assert readout.channel_names == ("E1", "difference")
     plan = readout.schedule
-    assert (plan.conversion, plan.period) == (near(2.5e-3, rel=1e-12), near(0.02, rel=1e-12))
+    assert (plan.conversion, plan.period) == (approx(2.5e-3, rel=1e-12), approx(0.02, rel=1e-12))
     assert plan.latency == 0.003
     assert readout.dac is not None
     assert readout.dac.start == 2
@@ -92,7 +92,7 @@ def test_everything_is_taken_over():
         0,
     )
     assert isinstance(climate, ClimateDrift)
-    assert climate.temperature.at(np.array([300.0]))[0] == near(26.0, rel=1e-12)
+    assert climate.temperature.at(np.array([300.0]))[0] == approx(26.0, rel=1e-12)
     assert climate.offset_per_kelvin == 1e-16
     assert climate.gain_per_kelvin == -37.5e-6  # the chip's
     assert climate.gain_per_percent == 2e-5
@@ -244,7 +244,7 @@ def test_a_tank_or_front_end_of_ones_own():
         "parasitic = 1e-12\nfull_scale = 0.5\nbits = 14\n[wiring]\ntrace = 4e-12\n"
     ).law
     assert isinstance(law, ShuntLaw)
-    assert law.front_end.parasitic == near(5e-12, rel=1e-12)
+    assert law.front_end.parasitic == approx(5e-12, rel=1e-12)
     rest = replace(law, front_end=replace(law.front_end, parasitic=0.0))
     assert rest == ShuntLaw(ShuntFrontEnd(5e5, 2e3, 20.0, 1.0, 3e6), 0.5, 14)
 
@@ -332,7 +332,7 @@ def test_choosing_by_name_or_file(tmp_path):
     assert choose_readout("MPR121", NAMES, least).law == CHIPS["mpr121"].law.set_for(0.2e-12)
     path = tmp_path / "mine.toml"
     path.write_text('chip = "fdc1004"\nrate = 400\n', encoding="utf-8")
-    assert choose_readout(path, NAMES, empty).schedule.conversion == near(2.5e-3, rel=1e-12)
+    assert choose_readout(path, NAMES, empty).schedule.conversion == approx(2.5e-3, rel=1e-12)
     with pytest.raises(ReadoutError, match="unknown chip 'mpr122'; did you mean 'mpr121'"):
         choose_readout("mpr122", NAMES, empty)
 

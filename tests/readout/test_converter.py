@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from approximate import approx
-from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.converter import CapDac, Conversion, Range, quantise
@@ -56,7 +55,7 @@ def test_quantisation_error_is_uniform():
     c = np.random.default_rng(0).uniform(-5e-12, 5e-12, 200_000)
     error = LINEAR.capacitance(quantise(LINEAR, c)[0]) - c
     assert np.abs(error).max() <= 0.5e-15 * (1 + 1e-9)
-    assert error.var() == near(1e-30 / 12, rel=0.02)
+    assert error.var() == approx(1e-30 / 12, rel=0.02)
     assert abs(error.mean()) < 5 * 1e-15 / math.sqrt(12 * len(c))
 
 
@@ -82,7 +81,7 @@ def test_shunt_law_by_its_full_scale():
     assert law.high == math.ceil(0.75 * 2**15) - 1
     c = np.array([1e-12, -1e-12])
     volts = np.abs(front_end.output(np.abs(c)))
-    assert law.level(c) == near(np.sign(c) * volts / 2.0 * 2**15, rel=1e-12)
+    assert law.level(c) == approx(np.sign(c) * volts / 2.0 * 2**15, rel=1e-12)
 
 
 def test_largest_nonlinearity_is_taken():
@@ -98,7 +97,7 @@ def test_nonlinearity(share):
     assert law.level(at) - straight.level(at) == approx(expected, abs=1e-9)
     line = np.linspace(-9e-12, 9e-12, 5000)
     assert (np.diff(law.level(line)) > 0).all()
-    assert np.abs(law.level(line) - straight.level(line)).max() == near(
+    assert np.abs(law.level(line) - straight.level(line)).max() == approx(
         abs(share) * 16000, rel=1e-3
     )
     assert (law.capacitance(np.arange(9)) == straight.capacitance(np.arange(9))).all()
@@ -110,21 +109,21 @@ def test_reciprocal_law():
     code = 16e-6 * 0.5e-6 / (c * 3.3) * 1024
     assert quantise(RECIPROCAL, c)[0] == round(code)
     step = RECIPROCAL.capacitance(np.array(500)) - RECIPROCAL.capacitance(np.array(501))
-    assert step == near(RECIPROCAL.capacitance(np.array(500)) / 501, rel=1e-9)
+    assert step == approx(RECIPROCAL.capacitance(np.array(500)) / 501, rel=1e-9)
     assert quantise(RECIPROCAL, np.array([0.0, -1e-12]))[1].tolist() == [Range.BELOW] * 2
     # The maker states 0.45 to 2880 pF at 1.8 V: 1 µA, 0.5 µs at the upper rail; 63 µA, 32 µs.
     small, large = ReciprocalLaw(1e-6, 0.5e-6, 1.8), ReciprocalLaw(63e-6, 32e-6, 1.8)
-    assert small.capacitance(np.array(small.high)) == near(0.45e-12, rel=0.02)
-    assert large.capacitance(np.array(large.low)) == near(2880e-12, rel=0.01)
+    assert small.capacitance(np.array(small.high)) == approx(0.45e-12, rel=0.02)
+    assert large.capacitance(np.array(large.low)) == approx(2880e-12, rel=0.01)
 
 
 def test_resonance_law():
     """Analytic: the tank's frequency, and its slope −C/2."""
     code = int(quantise(RESONANCE, 2e-12)[0])
     frequency = code / 2**28 * 40e6
-    assert frequency == near(1 / (2 * math.pi * math.sqrt(18e-6 * 35e-12)), rel=1e-7)
+    assert frequency == approx(1 / (2 * math.pi * math.sqrt(18e-6 * 35e-12)), rel=1e-7)
     change = (quantise(RESONANCE, 2.01e-12)[0] - code) / code
-    assert change == near(-0.5 * 0.01 / 35, rel=1e-3)
+    assert change == approx(-0.5 * 0.01 / 35, rel=1e-3)
 
 
 def test_a_weak_amplifier_ends_the_range():
@@ -164,7 +163,7 @@ def test_dac_steps():
     assert reported[7] - reported[4] == approx(0.0, abs=1e-15)
     assert reported[8] - reported[7] == approx(-1.4e-12, abs=2e-15)
     expected = np.array([1.1, 2.0, 3.1, 4.0, 5.1, 6.0, 7.1]) * 1e-12
-    assert CapDac(1e-12, 8, (0.1e-12,)).actual()[1:] == near(expected, rel=1e-12)
+    assert CapDac(1e-12, 8, (0.1e-12,)).actual()[1:] == approx(expected, rel=1e-12)
 
 
 def test_dac_follows_only_if_it_may():

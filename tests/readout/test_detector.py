@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from relative import near
+from approximate import approx
 
 from capsense.errors import ReadoutError
 from capsense.readout.converter import Detector, ExponentialTracker, Filter, SteppingTracker
@@ -47,7 +47,7 @@ def test_debounce():
 def test_exponential_tracker():
     """Analytic: a step decays as e^(−n/samples); a touch stops it."""
     baseline, _ = watch(Detector(1e6, 1e5, ExponentialTracker(20)), [0] + [100] * 60)
-    assert 100 - baseline[1:] == near(100 * np.exp(-np.arange(1, 61) / 20), rel=1e-9)
+    assert 100 - baseline[1:] == approx(100 * np.exp(-np.arange(1, 61) / 20), rel=1e-9)
     baseline, touched = watch(Detector(50, 20, ExponentialTracker(20)), [0] + [100] * 60)
     assert touched[1:].all()
     assert (baseline == 0).all()

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from approximate import approx
-from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.channels import Wiring
@@ -50,7 +49,7 @@ def test_conductance_turns_the_phase():
 def test_recovery_is_exact_for_phasors():
     """Round trip over eight decades, far beyond where the shunt's voltage is small."""
     c = np.geomspace(1e-18, 1e-10, 60)
-    assert PAPER.recover(PAPER.output(c)) == near(c, rel=1e-9)
+    assert PAPER.recover(PAPER.output(c)) == approx(c, rel=1e-9)
     assert PAPER.recover(0j) == 0.0
     assert PAPER.recover(0.0) == 0.0
 
@@ -59,7 +58,7 @@ def test_recovery_from_magnitudes_is_too_large():
     """Analytic: by the factor 1 + ω R_S C, to first order."""
     c = np.array([1e-15, 1e-13, 1e-12])
     excess = PAPER.recover(np.abs(PAPER.output(c))) / c - 1
-    assert excess == near(PAPER.omega * PAPER.shunt * c, rel=0.01)
+    assert excess == approx(PAPER.omega * PAPER.shunt * c, rel=0.01)
 
 
 @pytest.mark.parametrize(("bits", "codes"), [(4, [1, 7]), (12, [1, 300, 2047]), (16, [1, 30000])])
@@ -69,9 +68,9 @@ def test_codes_of_a_radio_by_hand(bits, codes, sign):
     law, most = ShuntLaw(PAPER, full_scale=0.5, bits=bits), 20.0 * 2.0
     volts = np.array(codes) * 0.5 / 2.0 ** (bits - 1)
     c = law.capacitance(sign * np.array(codes))
-    assert c == near(sign * volts / (2 * math.pi * 1e6 * 1e3 * (most - volts)), rel=1e-9)
+    assert c == approx(sign * volts / (2 * math.pi * 1e6 * 1e3 * (most - volts)), rel=1e-9)
     smaller = most / np.hypot(most - volts, volts)
-    assert law.level(c) == near(sign * smaller * codes, rel=1e-9)
+    assert law.level(c) == approx(sign * smaller * codes, rel=1e-9)
     assert law.capacitance(np.array(0)) == 0.0
 
 
@@ -80,9 +79,9 @@ def test_parasitics_and_bandwidth_are_gain_errors():
     c = 1e-15
     loaded = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0, parasitic=50e-12)
     turn = loaded.omega * loaded.shunt * loaded.parasitic
-    assert loaded.recover(loaded.output(c)) / c == near(1 / math.hypot(1, turn), rel=1e-4)
+    assert loaded.recover(loaded.output(c)) / c == approx(1 / math.hypot(1, turn), rel=1e-4)
     slow = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0, bandwidth=3e6)
-    assert slow.recover(slow.output(c)) / c == near(1 / math.hypot(1, 1 / 3), rel=1e-4)
+    assert slow.recover(slow.output(c)) / c == approx(1 / math.hypot(1, 1 / 3), rel=1e-4)
 
 
 def test_demodulation_equals_its_closed_form():
@@ -107,7 +106,7 @@ def test_whole_periods_give_the_phasor():
         samples = PAPER.waveform(c, 25e6, 2500)
         phasor = demodulate(samples, PAPER.excitation_frequency, 25e6)
         assert abs(phasor - PAPER.output(c)) < 1e-9 * abs(phasor)
-        assert PAPER.recover(phasor) == near(c, rel=1e-7)
+        assert PAPER.recover(phasor) == approx(c, rel=1e-7)
         assert demodulated(PAPER.output(c), 1e6, 1e6, 25e6, 2500) == approx(phasor)
     batch = rng.standard_normal((4, 5, 100))
     assert demodulate(batch, 1e6, 25e6).shape == (4, 5)
@@ -119,7 +118,7 @@ def test_noise_of_demodulation():
     phasor = demodulate(noise, 1e6, 25e6)
     expected = 2 * 0.3**2 / 200
     for part in (phasor.real, phasor.imag):
-        assert part.var() == near(expected, rel=5 * math.sqrt(2 / 20_000))
+        assert part.var() == approx(expected, rel=5 * math.sqrt(2 / 20_000))
     assert abs(np.corrcoef(phasor.real, phasor.imag)[0, 1]) < 5 / math.sqrt(20_000)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from approximate import approx
-from relative import near
 from scipy.optimize import nnls
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
@@ -90,7 +89,7 @@ def field():
 def test_energy(field):
     """Invariant: weighted with the permittivity, the sensitivities sum to the capacitance."""
     eps_r, _, capacitance, j = field
-    assert j @ eps_r.ravel() == near([capacitance[p] for p in PAIRS], rel=1e-9)
+    assert j @ eps_r.ravel() == approx([capacitance[p] for p in PAIRS], rel=1e-9)
 
 
 def test_derivative_by_permittivity(field):
@@ -114,12 +113,12 @@ def test_grounded_matter(field):
     change = solve(eps_r, grounded=node)[1] - capacitance
     product = np.array([potentials[node][i] * potentials[node][j] for i, j in PAIRS])
     ratio = np.array([change[p] for p in PAIRS]) / product
-    assert ratio == near(np.full(len(PAIRS), ratio[0]), rel=1e-8)
+    assert ratio == approx(np.full(len(PAIRS), ratio[0]), rel=1e-8)
     assert ratio[0] > 0
     j = grounded_sensitivity(potentials, AXES, PAIRS).reshape(len(PAIRS), *CELLS)
     corners = potentials[2:4, 1:3, 4:6].reshape(8, 3)
     expected = [(corners[:, a] * corners[:, b]).mean() for a, b in PAIRS]
-    assert j[:, 2, 1, 4] == near(expected, rel=1e-12)
+    assert j[:, 2, 1, 4] == approx(expected, rel=1e-12)
 
 
 def test_uniform_field_is_exact():
@@ -128,7 +127,7 @@ def test_uniform_field_is_exact():
     phi = np.broadcast_to(1 - z / z[-1], SHAPE)[..., None]
     j = sensitivity(phi, AXES, [(0, 0)])[0]
     volume = np.einsum("i,j,k->ijk", *(np.diff(a) for a in AXES)).ravel()
-    assert j == near(EPS0 * volume / z[-1] ** 2, rel=1e-12)
+    assert j == approx(EPS0 * volume / z[-1] ** 2, rel=1e-12)
 
 
 def test_voxel_centres_are_in_the_order_of_columns(field):
@@ -137,10 +136,10 @@ def test_voxel_centres_are_in_the_order_of_columns(field):
     assert centres.shape == (np.prod(CELLS), 3)
     for number, cell in enumerate(np.ndindex(*CELLS)):
         middle = [(axis[k] + axis[k + 1]) / 2 for axis, k in zip(AXES, cell, strict=True)]
-        assert centres[number] == near(middle, rel=1e-12)
+        assert centres[number] == approx(middle, rel=1e-12)
     _, _, _, j = field
     spot = centres[np.argmax(j[PAIRS.index((0, 0))])]
-    assert spot[2] == near(0.0025, rel=1e-9)
+    assert spot[2] == approx(0.0025, rel=1e-9)
     assert 0 < spot[0] < 0.035
 
 
@@ -163,9 +162,9 @@ def test_tikhonov_minimises_what_it_states(field):
     strength = 1e-2 * np.linalg.eigvalsh(scaled @ scaled.T)[-1]
     inverse = np.linalg.inv(scaled.T @ scaled + strength * np.eye(j.shape[1]))
     direct = inverse @ scaled.T @ d
-    assert tikhonov(scaled, 1e-2, standardised=False) @ d == near(direct, rel=1e-5)
+    assert tikhonov(scaled, 1e-2, standardised=False) @ d == approx(direct, rel=1e-5)
     own = np.sqrt(np.diag(inverse @ scaled.T @ scaled))
-    assert tikhonov(scaled, 1e-2) @ d == near(direct / own, rel=1e-5)
+    assert tikhonov(scaled, 1e-2) @ d == approx(direct / own, rel=1e-5)
 
 
 def test_tikhonov_explains_the_data_as_strength_falls(field):
@@ -193,7 +192,7 @@ def test_landweber_tends_to_the_constrained_least_squares(field):
         assert (image >= 0).all()
         misfits.append(np.linalg.norm(scaled @ image - d))
     assert (np.diff(misfits) <= 0).all()
-    assert misfits[-1] == near(best, rel=0.02)
+    assert misfits[-1] == approx(best, rel=0.02)
     assert landweber(scaled, 50, low=-0.1, high=0.2)(d).max() <= 0.2
 
 
@@ -203,7 +202,7 @@ def test_landweber_by_the_signal_of_voxels(field):
     d = j @ np.random.default_rng(5).uniform(0, 1, j.shape[1])
     found = landweber(j, 30, unit_voxels=True)(d)
     expected = landweber(j / np.linalg.norm(j, axis=0), 30)(d)
-    assert found == near(expected, rel=1e-9)
+    assert found == approx(expected, rel=1e-9)
     assert np.abs(landweber(j, 30)(d) - found).max() > 0
 
 

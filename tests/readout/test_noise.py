@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from approximate import approx
-from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.noise import (
@@ -58,9 +57,9 @@ def test_allan_deviation_is_its_definition():
     """Differential: against means written out; a drift gives drift·τ/√2 exactly."""
     values = np.random.default_rng(0).standard_normal(200)
     for m in (1, 2, 7, 40, 100):
-        assert allan_deviation(values, [m])[0] == near(slow_allan(values, m), rel=1e-9)
+        assert allan_deviation(values, [m])[0] == approx(slow_allan(values, m), rel=1e-9)
     ramp = 3.0 * np.arange(100)
-    assert allan_deviation(ramp, [10])[0] == near(3.0 * 10 / math.sqrt(2), rel=1e-9)
+    assert allan_deviation(ramp, [10])[0] == approx(3.0 * 10 / math.sqrt(2), rel=1e-9)
     assert allan_deviation(np.ones((50, 2, 3)), [5]).shape == (1, 2, 3)
     with pytest.raises(ReadoutError, match="is 101; give a whole number from 1 to 100"):
         allan_deviation(values, [101])
@@ -71,16 +70,16 @@ def test_white_noise():
     rms = 2.5e-15
     samples = run(White(rms), 2048, 200, value=1e-12) - 1e-12
     count = samples.size
-    assert samples.std() == near(rms, rel=5 / math.sqrt(2 * count))
+    assert samples.std() == approx(rms, rel=5 / math.sqrt(2 * count))
     assert abs(samples.mean()) < 5 * rms / math.sqrt(count)
     _, density = spectrum(samples)
     level = 2 * rms**2 * PERIOD
     bands = np.array_split(density, 8)
     for band in bands:
-        assert band.mean() == near(level, rel=5 / math.sqrt(200 * len(band) / 2))
+        assert band.mean() == approx(level, rel=5 / math.sqrt(200 * len(band) / 2))
     averages = np.array([1, 4, 16, 64])
     deviation = np.sqrt((allan_deviation(samples, averages) ** 2).mean(axis=1))
-    assert deviation == near(rms / np.sqrt(averages), rel=0.03)
+    assert deviation == approx(rms / np.sqrt(averages), rel=0.03)
     correlation = np.corrcoef(samples[:, :20].T) - np.eye(20)
     assert np.abs(correlation).max() < 6 / math.sqrt(2048)
 
@@ -88,7 +87,7 @@ def test_white_noise():
 def test_white_noise_in_proportion():
     """Statistical: absolute and relative parts add in quadrature."""
     noisy = run(White(3e-15, relative=4e-3), 2000, 50, value=1e-12) - 1e-12
-    assert noisy.std() == near(5e-15, rel=5 / math.sqrt(2 * noisy.size))
+    assert noisy.std() == approx(5e-15, rel=5 / math.sqrt(2 * noisy.size))
 
 
 def flicker_variance(taus, variance, m):
@@ -111,7 +110,7 @@ def test_flicker_model_has_the_floor_it_states():
     stage = Flicker(1e-15, slowest=1e5)
     taus, variance = stage.poles(PERIOD)
     for m in (4, 16, 64, 256, 1024, 4096):
-        assert math.sqrt(flicker_variance(taus, variance, m)) == near(1e-15, rel=0.02)
+        assert math.sqrt(flicker_variance(taus, variance, m)) == approx(1e-15, rel=0.02)
 
 
 def test_flicker_noise():
@@ -119,13 +118,13 @@ def test_flicker_noise():
     floor = 1e-15
     samples = run(Flicker(floor, slowest=1e4), 4096, 300)
     deviation = np.sqrt((allan_deviation(samples, [8, 32, 128, 512]) ** 2).mean(axis=1))
-    assert deviation == near(np.full(4, floor), rel=0.06)
+    assert deviation == approx(np.full(4, floor), rel=0.06)
     frequency, density = spectrum(samples)
     band = (frequency > 0.2) & (frequency < 5)
     slope, _ = np.polyfit(np.log(frequency[band]), np.log(density[band]), 1)
     assert slope == approx(-1.0, abs=0.05)
     h = floor**2 / (2 * math.log(2))
-    assert (density[band] * frequency[band]).mean() == near(h, rel=0.05)
+    assert (density[band] * frequency[band]).mean() == approx(h, rel=0.05)
 
 
 def test_flicker_starts_in_its_stationary_state():
@@ -133,7 +132,7 @@ def test_flicker_starts_in_its_stationary_state():
     samples = run(Flicker(1e-15), 200, 4000)
     taus, variance = Flicker(1e-15).poles(PERIOD)
     for row in (samples[0], samples[-1]):
-        assert row.var() == near(variance * len(taus), rel=5 * math.sqrt(2 / 4000))
+        assert row.var() == approx(variance * len(taus), rel=5 * math.sqrt(2 / 4000))
 
 
 def test_random_walk():
@@ -141,10 +140,10 @@ def test_random_walk():
     rate = 1e-15
     samples = run(RandomWalk(rate), 2000, 400)
     time = 2000 * PERIOD
-    assert samples[-1].std() == near(rate * math.sqrt(time), rel=5 / math.sqrt(800))
+    assert samples[-1].std() == approx(rate * math.sqrt(time), rel=5 / math.sqrt(800))
     averages = np.array([20, 60, 200])
     deviation = np.sqrt((allan_deviation(samples, averages) ** 2).mean(axis=1))
-    assert deviation == near(rate * np.sqrt(averages * PERIOD / 3), rel=0.05)
+    assert deviation == approx(rate * np.sqrt(averages * PERIOD / 3), rel=0.05)
 
 
 @pytest.mark.parametrize("order", [1, 3])
@@ -157,7 +156,7 @@ def test_mains_is_averaged_and_folded(order):
     assert samples[1::2] == approx(np.full(500, -samples[0]), abs=1e-20)
     shifted = run(Mains(1e-14, 47.0, order), 1000, 1, conversion=0.004)[:, 0]
     expected = 1e-14 * abs(np.sinc(47 * 0.004)) ** order
-    assert np.sqrt(2 * np.mean(shifted**2)) == near(expected, rel=1e-3)
+    assert np.sqrt(2 * np.mean(shifted**2)) == approx(expected, rel=1e-3)
     assert np.abs(run(stage, 100, 1, conversion=0.02)).max() < 1e-28
 
 
@@ -184,7 +183,7 @@ def test_climate():
     found = process(np.arange(3), np.array([0.0, 5.0, 20.0]), np.full(3, 1e-12))
     kelvin = np.array([0.0, 5.0, 10.0])
     expected = (1 + 1e-3 * kelvin + 0.02) * 1e-12 + 2e-15 * kelvin + 3e-14
-    assert found == near(expected, rel=1e-12)
+    assert found == approx(expected, rel=1e-12)
 
 
 STAGES = [White(1e-15, 1e-3), Flicker(1e-15), RandomWalk(1e-15), Mains(1e-15)]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from approximate import approx
 from maxwell import random_maxwell
-from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout import Readout
@@ -70,7 +69,7 @@ def test_channels_are_read_at_their_own_instants():
     counts = join([*parts, readout.sample(0.2, world(0.2))])
     assert len(counts) == readout.schedule.samples_until(0.2 - 1e-3)
     instants = counts.time - 1e-3
-    assert instants[:4] == near([1.1e-3, 3.2e-3, 5.3e-3, 7.4e-3], rel=1e-12)
+    assert instants[:4] == approx([1.1e-3, 3.2e-3, 5.3e-3, 7.4e-3], rel=1e-12)
     assert counts.channel[:4].tolist() == [0, 1, 2, 0]
     expected = [world(t)[c, c] for t, c in zip(instants, counts.channel, strict=True)]
     assert np.abs(counts.capacitance - expected).max() < 1e-20
@@ -98,7 +97,7 @@ def test_interpolation_error_is_second_order():
         exact = moving(counts.time - 1e-3, np.random.default_rng(2))
         truth = exact[np.arange(len(counts)), counts.channel, counts.channel]
         errors.append(np.abs(counts.capacitance - truth).max())
-    assert np.array(errors[:-1]) / errors[1:] == near(4.0, rel=0.15)
+    assert np.array(errors[:-1]) / errors[1:] == approx(4.0, rel=0.15)
 
 
 def test_results_are_late():
@@ -229,12 +228,12 @@ def test_wiring():
     counts = plain(Schedule.simultaneous(3, 1e-3), wiring=wiring)([0.0, 0.01], [matrix, matrix])
     c = np.diag(matrix)
     expected = c + 0.1 * (c.sum() - c) + np.array([1, 2, 3]) * 1e-13 + 0.02 * 1e-11
-    assert counts.capacitance[:3] == near(expected, rel=1e-9)
+    assert counts.capacitance[:3] == approx(expected, rel=1e-9)
     moved = plain(Schedule.sequential(3, 1e-3), wiring=Wiring(crosstalk=[[0, 1, 0]] * 3))
     ramp = np.array([matrix, 2 * matrix])
     mixed = moved([0.0, 0.01], ramp)
     at = (1 + (mixed.time - 0.5e-3) / 0.01)[:3]
-    assert mixed.capacitance[:3] == near(at * (c + np.array([c[1], c[1], c[1]])), rel=1e-6)
+    assert mixed.capacitance[:3] == approx(at * (c + np.array([c[1], c[1], c[1]])), rel=1e-6)
 
 
 def test_wiring_of_mutual_channels():
@@ -247,7 +246,7 @@ def test_wiring_of_mutual_channels():
     matrix = random_maxwell(np.random.default_rng(2), 3)
     counts = readout([0.0, 0.01], [matrix, matrix])
     expected = [matrix[0, 0] + 4e-12 + 5e-12, -matrix[1, 0] + 2e-13]
-    assert counts.capacitance[:2] == near(expected, rel=1e-8)
+    assert counts.capacitance[:2] == approx(expected, rel=1e-8)
 
 
 @dataclass
@@ -267,11 +266,11 @@ def test_readings_of_a_simulator():
     patterns = [Pattern("A", shield=1.0), Pattern("B", shield=0.0), Pattern("C", {"A": 1.0})]
     readout = Readout(ChannelBank(patterns, NAMES), Schedule.simultaneous(3, 1e-3), FINE)
     expected = [matrix[0, 0] + coupling[0], matrix[1, 1], -matrix[2, 0]]
-    assert readout.channel_values(reading) == near(expected, rel=1e-12)
+    assert readout.channel_values(reading) == approx(expected, rel=1e-12)
     assert readout.channel_values(np.array(expected)).tolist() == expected
     readout.sample(0.0, reading)
-    assert readout.sample(1.0, reading).capacitance[:3] == near(expected, rel=1e-8)
-    assert readout([0.0, 1.0], [reading, reading]).capacitance[:3] == near(expected, rel=1e-8)
+    assert readout.sample(1.0, reading).capacitance[:3] == approx(expected, rel=1e-8)
+    assert readout([0.0, 1.0], [reading, reading]).capacitance[:3] == approx(expected, rel=1e-8)
     other = Reading(matrix, np.diag(matrix), ("A", "C", "B"))
     with pytest.raises(ReadoutError, match="make it with the simulator's electrode_names"):
         readout.sample(2.0, other)
@@ -397,7 +396,7 @@ def test_stages_are_applied_in_their_order():
         )
         counts = readout([0.0, 1.0], np.full((2, 3), 1e-12))
         assert (counts.code == expected**2).all()
-        assert counts.capacitance == near(np.full(len(counts), expected * 1e-15), rel=1e-12)
+        assert counts.capacitance == approx(np.full(len(counts), expected * 1e-15), rel=1e-12)
 
 
 def test_a_stage_that_fails_is_noticed():

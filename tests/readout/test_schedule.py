@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from approximate import approx
-from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.conversions import Schedule, idle_of, rounds
@@ -38,9 +37,9 @@ def test_instants_follow_the_slots(plan):
     """Differential: instants and channels of many cycles."""
     expected = written_out(plan, 50)
     number = np.arange(len(expected))
-    assert plan.instant(number) == near([t for t, _ in expected], rel=1e-12)
+    assert plan.instant(number) == approx([t for t, _ in expected], rel=1e-12)
     assert (plan.order[number % plan.count] == [c for _, c in expected]).all()
-    assert plan.period == near(expected[plan.count][0] - expected[0][0], rel=1e-12)
+    assert plan.period == approx(expected[plan.count][0] - expected[0][0], rel=1e-12)
 
 
 @pytest.mark.parametrize("plan", PLANS)

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from relative import near
+from approximate import approx
 
 from capsense.errors import SceneError
 from capsense.scene.materials import GROUND_PATHS, GroundPath
@@ -14,16 +14,16 @@ def test_impedance_of_the_circuit(frequency):
     """Analytic: a series branch beside a leakage."""
     path = GroundPath(120e-12, 800.0, 2e6)
     branch = 800.0 - 1j / (2 * math.pi * frequency * 120e-12)
-    assert path.impedance(frequency) == near(branch * 2e6 / (branch + 2e6), rel=1e-12)
+    assert path.impedance(frequency) == approx(branch * 2e6 / (branch + 2e6), rel=1e-12)
 
 
 def test_equivalent_capacitance():
     """Analytic: a bare capacitor is its own equivalent; a series resistance lowers it."""
-    assert GroundPath(100e-12).equivalent_capacitance(1e6) == near(100e-12, rel=1e-12)
+    assert GroundPath(100e-12).equivalent_capacitance(1e6) == approx(100e-12, rel=1e-12)
     path = GROUND_PATHS["human-body model"]
     turn = 2 * math.pi * 250e3 * 1.5e3 * 100e-12
     expected = 100e-12 / math.hypot(1.0, turn)
-    assert path.equivalent_capacitance(250e3) == near(expected, rel=1e-12)
+    assert path.equivalent_capacitance(250e3) == approx(expected, rel=1e-12)
 
 
 def test_every_path_names_its_source():

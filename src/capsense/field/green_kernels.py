@@ -127,9 +127,10 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     radius = np.zeros(len(size))
     np.maximum.at(radius, number, np.linalg.norm(points - center[number], axis=1))
     least = float(table.heights[0])
-    if cover_of(design) > 0.0:
+    cover = cover_of(design)
+    if cover > 0.0:
         most = max([1.0, *(layer.eps_r for layer in design.layers)])
-        least = min(least, _THIN * cover_of(design) / most)
+        least = min(least, _THIN * cover / most)
     return Gap(
         table.validity, face, 0.0 if design.film is None else 1.0 / design.film.radius, table.top,
         table.heights, math.log(table.heights[1] / table.heights[0]),

@@ -110,8 +110,7 @@ def add_own(bodies, cut, functions, inside, matrix, rest, own):
         inside: Whether it is the impedance of the inside that is added, which net charge does not
             meet, or the energies in free space.
         matrix, rest, own: See :class:`~capsense.solver.system.system_kernels.System`; of the
-        matrix, only
-            what is not above the diagonal is added to.
+            matrix, only what is not above the diagonal is added to.
     """
     total, solved = functions.cluster.shape[0], functions.solved
     of, first = np.empty(total, np.int64), np.int64(0)

@@ -35,7 +35,7 @@ def solve_lossy(
         records: The bodies, whose real softness is not looked at, nor are ties where ``ties`` are
             finite. Energies are linear in softness.
         ties: Energy of the bodies' net charges [1/m], infinite for floating ones, shape (n,).
-        softness: 1 / (eps - 1), shape (n,).
+        inverse_susceptibility: 1 / (eps - 1), shape (n,).
         green, threshold, width: As in :func:`prepared`.
     """
     fabric = np.zeros((green.terminals, green.terminals))

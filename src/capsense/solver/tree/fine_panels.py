@@ -262,10 +262,8 @@ class FinePanelBody(DynamicBody):
         self.weights = _equilibrium(panels, cluster)
         super().__init__(tree, panels, charge=self.weights)
         self._points, self._softening_length = points_of_each(self._center, self._spread)
-        for name in (
-            "points",
-            "softening_length",
-        ):  # the body is rigid: they are needed at every step
+        # the body is rigid: they are needed at every step
+        for name in ("points", "softening_length"):
             self.record[name] = getattr(self, f"_{name}").ctypes.data
         last = np.flatnonzero(number >= 0)
         # of rectangles: these stand badly for larger clusters, which may be bent or have limbs

@@ -29,11 +29,12 @@ def split(features, charges, order, first, last, children):
     Args:
         features: Centres and scaled normals of the panels in whole numbers of some grain, shape
             (n, 6).
-        charges: Equilibrium charges of the panels, shape (n,). order: Filled with the panels, those
-        of a cluster side by side, shape (n,). first: Filled with the first place in ``order`` of
-        each cluster, shape (2 n - 1,). last: Filled with the place behind the last one, shape (2 n
-        - 1,). children: Filled with the two parts of each cluster, -1 for a single panel, shape (2
-        n - 1, 2).
+        charges: Equilibrium charges of the panels, shape (n,).
+        order: Filled with the panels, those of a cluster side by side, shape (n,).
+        first: Filled with the first place in ``order`` of each cluster, shape (2 n - 1,).
+        last: Filled with the place behind the last one, shape (2 n - 1,).
+        children: Filled with the two parts of each cluster, -1 for a single panel, shape
+            (2 n - 1, 2).
     """
     n = features.shape[0]
     for i in range(n):
