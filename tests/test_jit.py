@@ -19,12 +19,25 @@ from numba.core.errors import TypingError
 
 import capsense
 from capsense import _jit
+from capsense._by_reference import by_reference
 from capsense.field.face_kernels import smooth
 
 
 class Pair(NamedTuple):
     first: Any
     second: Any
+
+
+class Inner(NamedTuple):
+    values: Any
+    limit: float
+
+
+@by_reference
+class Outer(NamedTuple):
+    inner: Inner
+    weights: Any
+    count: int
 
 
 def build(compiled: Callable[..., Any], kernel: Callable[..., Any]) -> tuple[Any, Any]:
@@ -146,3 +159,31 @@ def test_a_kernel_in_another_process(tmp_path: Path) -> None:
 def test_this_version_of_numba_is_known() -> None:
     """Else a first reading takes almost twice as long: try it, and widen ``_jit._PARTS``."""
     assert _jit._PARTS[0] <= numba.version_info.short <= _jit._PARTS[1]
+
+
+def test_tuples_by_reference() -> None:
+    """Differential: compiled code reads and returns what Python sees, and counts references."""
+
+    def weigh(inner: Any, weights: Any) -> Any:
+        total = 0.0
+        for i in range(weights.shape[0]):
+            total += min(inner.values[i], inner.limit) * weights[i]
+        return total
+
+    kernel_weigh = _jit.kernel(weigh)
+
+    @_jit.compiled
+    def both(given: Any) -> Any:
+        return kernel_weigh(given.inner, given.weights), given.inner.values, given.count
+
+    values, weights = np.arange(5.0), np.linspace(1.0, 2.0, 5)
+    references = sys.getrefcount(values), sys.getrefcount(weights)
+    for count in range(3):
+        found = both(Outer(Inner(values, 2.5), weights, count))
+        assert found[0] == weigh(Inner(values, 2.5), weights)
+        assert found[2] == count
+        np.testing.assert_array_equal(found[1], values)
+    del found
+    assert (sys.getrefcount(values), sys.getrefcount(weights)) == references
+    with pytest.raises(TypingError, match="missing"):
+        _jit.compiled(lambda given: given.missing)(Outer(Inner(values, 2.5), weights, 0))

@@ -490,7 +490,7 @@ def test_jacobian_of_the_other_method_is_refused(simulators):
         simulators("six_patch_bare", method="fem_masked").step(cs.Scene(), jacobian=True)
 
 
-@pytest.mark.parametrize(("name", "value"), [("method", "lattice"), ("preset", "fast")])
+@pytest.mark.parametrize(("name", "value"), [("method", "lattice"), ("preset", "rapid")])
 def test_unknown_options(name, value):
     with pytest.raises(ValueError, match=f"{name} is '{value}'; choose one of"):
         cs.Simulator("six_patch_bare", **{name: value})

@@ -130,7 +130,7 @@ def _announce() -> None:
     _said = True
     often = "once on this machine" if _kernel_cache.kept else "in each process"
     _log.warning(
-        "compiling kernels for this processor; it takes up to a minute %s; "
+        "compiling kernels for this processor; it takes about a minute %s; "
         "capsense warmup does it ahead of time", often,
     )  # fmt: skip
 
@@ -154,7 +154,12 @@ class _Part(CPUDispatcher):
     def compile(self, sig: Any) -> Any:
         """Compile for types, unless another process has, or does."""
         # Numba's lock comes first: a thread must not wait for it with a file locked
-        with global_compiler_lock, self._cache.alone(sig, self.targetctx), _nothing_collected():
+        with (
+            global_compiler_lock,
+            self._cache.alone(sig, self.targetctx),
+            _nothing_collected(),
+            _optimized(),
+        ):
             return super().compile(sig)
 
 
@@ -202,6 +207,21 @@ def _nothing_collected() -> Iterator[None]:
     finally:
         if was:
             gc.enable()
+
+
+_LEVEL = int(os.environ.get("NUMBA_OPT", "1").replace("max", "3"))
+"""LLVM's level of optimisation. At 3 compiling takes a third longer, and steps take as long."""
+
+
+@contextmanager
+def _optimized() -> Iterator[None]:
+    """With that level, in place of the one that Numba takes for everybody's functions."""
+    was = config.OPT  # type: ignore[attr-defined]
+    config.OPT = type(was)(_LEVEL)  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        config.OPT = was  # type: ignore[attr-defined]
 
 
 _OFF = bool(config.DISABLE_JIT)  # type: ignore[attr-defined]

@@ -31,7 +31,7 @@ def ensure_place(package: Path) -> None:
 
     logging.getLogger("capsense").warning(
         "compiled kernels cannot be kept: neither %s nor %s can be written, so that each process "
-        "compiles for up to a minute; set NUMBA_CACHE_DIR to a folder that can", package, home,
+        "compiles for about a minute; set NUMBA_CACHE_DIR to a folder that can", package, home,
     )  # fmt: skip
     folder = _temporary()
     if folder is None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
+from capsense._by_reference import by_reference
 from capsense._jit import kernel
 
 WALL_FADE_LENGTH = 0.01
@@ -20,6 +21,7 @@ DEEP, STEEP = (2.3, 3.8), 4.0
 distance, comes to be screened by it, over the second; depth from the sides counts so many times."""
 
 
+@by_reference
 class Space(NamedTuple):
     """The surroundings of a design, as kernels take them that are called for single points."""
 

@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._by_reference import by_reference
 from capsense._dense import WIDTH, three
 from capsense._jit import compiled, kernel
 from capsense._simd import (
@@ -60,6 +61,7 @@ class Level(NamedTuple):
     """No point counts as nearer to one than this [m]."""
 
 
+@by_reference
 class Gap(NamedTuple):
     """A :class:`~capsense.field.gap_table.GapTable`, as the kernels take it; without cells if the
     design has none."""
@@ -143,6 +145,7 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     )  # fmt: skip
 
 
+@by_reference
 class Green(NamedTuple):
     """A design's Green's function, as the kernels take it."""
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._by_reference import by_reference
 from capsense._jit import kernel
 from capsense._simd import (
     SIMD_WIDTH,
@@ -41,6 +42,7 @@ _BEYOND = 0.02
 """How far the table reaches beyond the walls [m]."""
 
 
+@by_reference
 class Grid(NamedTuple):
     """Values on the nodes of a grid; single precision."""
 

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from capsense._by_reference import by_reference
 from capsense.cover import NONE
 from capsense.design.model import Design
 from capsense.field.gap_table import GapTable
@@ -19,6 +20,7 @@ BODY, FABRIC = 0, 1
 """Codes of :attr:`Soft.top`."""
 
 
+@by_reference
 class Soft(NamedTuple):
     """The cover of a flat design; its thickness is 0 if it has none."""
 

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from capsense._by_reference import by_reference
 from capsense._jit import compiled, kernel
 from capsense.cover import Cover
 from capsense.design.geometry import Surface
@@ -29,6 +30,7 @@ _BISECTIONS = 200
 """Bisections at most; double precision is reached before."""
 
 
+@by_reference
 class Foundation(NamedTuple):
     """A cover as an elastic foundation, and the outlines of the electrodes below it.
 
