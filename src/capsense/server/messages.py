@@ -30,7 +30,7 @@ from capsense.scenario import (
 from capsense.scene import Body, DepthFrame, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.materials import Grounding
-from capsense.server import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
+from capsense.server.binary import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
 
 MAX_TEXT = 65536
 """Largest control message [bytes]."""

@@ -15,7 +15,7 @@ from capsense.design.geometry import Surface
 from capsense.field.background import Charges
 from capsense.plotting.designs import ROLE_COLOURS
 from capsense.scene import Body, Layers, Pose, Scene, Shape, ShapeKind
-from capsense.viewer.charts import Plane
+from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
     from viser import ViserServer

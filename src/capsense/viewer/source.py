@@ -24,10 +24,10 @@ from capsense.server import DepthMessage, ReadingMessage
 from capsense.server.client import Client
 from capsense.server.messages import MessageTable, Open, read_open, read_scene
 from capsense.simulator import Simulator
+from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
     from capsense.recording.reader import Recording
-    from capsense.viewer.charts import Plane
 
 
 Array = NDArray[np.float64]
