@@ -16,7 +16,8 @@ from capsense.errors import SolveError
 from capsense.field.background import Terminals
 from capsense.field.face_kernels import WALL_FADE_LENGTH
 from capsense.field.green_kernels import Green
-from capsense.fleet.bodies import Bodies, BodyTable, FleetReading, FleetTouch
+from capsense.fleet.bodies import Bodies, BodyTable
+from capsense.reading import FleetReading, FleetTouch
 from capsense.solver.gap.gap_kernels import near_bodies
 from capsense.solver.gap.touch_kernels import Foundation, press
 from capsense.solver.surface_solver import SurfaceSolver

@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 from capsense._validate import as_number, read_toml, suggest
 from capsense.errors import ReadoutError
-from capsense.readout import Readout
 from capsense.readout.channels import ChannelBank, Pattern, Wiring, mutual_patterns, self_patterns
 from capsense.readout.checks import Array, require
 from capsense.readout.conversions import Schedule, idle_of
@@ -29,6 +28,7 @@ from capsense.readout.laws import (
     ShuntLaw,
 )
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, Stage, White
+from capsense.readout.readout import Readout
 
 Mode = Literal["self", "mutual"]
 

@@ -13,8 +13,8 @@ from enum import IntEnum, IntFlag
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.cover import Touch
 from capsense.errors import ProtocolError
+from capsense.reading import Touch
 
 MAGIC = b"CSNS"
 PROTOCOL = 1

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._style import COLOURS
-from capsense.cover import Touch
+from capsense.reading import Touch
 from capsense.scenario import Channel
 from capsense.viewer.plane import AXES, OCTAVES, Plane, palette, region
 from capsense.viewer.player import Playback

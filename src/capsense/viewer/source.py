@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from capsense.codec import design_from_json
 from capsense.errors import ProtocolError, RecordingError, ServerError
-from capsense.field.background import Charges
-from capsense.reading import Reading, StepStats
+from capsense.reading import Charges, Reading, StepStats
 from capsense.recording import GONE, reading_of
 from capsense.scenario import Channel, Scenario
 from capsense.scenario.model import Excitation, channels_of
