@@ -18,6 +18,7 @@ from capsense.readout.conversions import Counts, Schedule
 from capsense.readout.converter import CapDac, Conversion, Detector
 from capsense.readout.laws import Law, ShuntLaw
 from capsense.readout.noise import Context, Process, Stage
+from capsense.readout.presets import Chip, ReadoutOptions, chip_of, parts_of
 
 _BATCH = 4096
 """Samples processed at a time."""
@@ -99,13 +100,11 @@ class Readout:
 
     @classmethod
     def preset(cls, chip: str, electrodes: Sequence[str], **options: Any) -> Readout:
-        """A readout with the figures of a known chip; see :func:`~capsense.readout.presets.build`.
+        """A readout with the figures of a known chip; see :func:`build`.
 
         Raises:
             ReadoutError: No such chip, or an option is wrong.
         """
-        from capsense.readout.presets import ReadoutOptions, build
-
         return build(chip, electrodes, ReadoutOptions.of(options))
 
     def __repr__(self) -> str:
@@ -395,6 +394,25 @@ class Readout:
         )
         if self._detect is not None and counts.baseline is not None and counts.touched is not None:
             counts.baseline[:], counts.touched[:] = self._detect(counts.channel, counts.code)
+
+
+def build(
+    chip: str | Chip, electrodes: Sequence[str], options: ReadoutOptions | None = None
+) -> Readout:
+    """A readout with a chip's figures.
+
+    Args:
+        chip: A known chip's name, or a chip.
+        electrodes: Electrode names in matrix order.
+        options: What is chosen.
+
+    Raises:
+        ReadoutError: No such chip, a rate it does not have, or an option is wrong.
+    """
+    part = chip if isinstance(chip, Chip) else chip_of(chip)
+    out = Readout(**parts_of(part, electrodes, options or ReadoutOptions()))
+    out.name = part.title
+    return out
 
 
 def _is_reading(capacitance: object) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.constants import UNIT
 from capsense.design.model import Design
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.face import sheet_on_face
@@ -39,7 +40,7 @@ from capsense.solver.system.step import (
     solve_each,
 )
 from capsense.solver.tree.dynamic_surface import DynamicBody
-from capsense.solver.tree.matter import UNIT, Matter, matter_of, sizes_of
+from capsense.solver.tree.matter import Matter, matter_of, sizes_of
 from capsense.solver.tree.rigid import BODY, RigidShape
 from capsense.solver.tree.shape_cache import functions_of
 
