@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fleet"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
+from fleet_scenes import LONG, long_poses, scene
 from reference_scenes import DESIGN, fleet_of, reference_scenes
 from smoothness import BODIES
-from test_fleet import LONG, long_poses, scene
 
 import capsense as cs
 from fleet import PRIMITIVES
