@@ -21,12 +21,12 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
+from fleet import PRIMITIVES
 from fleet_scenes import LONG, long_poses, scene
 from reference_scenes import DESIGN, fleet_of, reference_scenes
 from smoothness import BODIES
 
 import capsense as cs
-from fleet import PRIMITIVES
 
 DEVICE = "warp:cpu"
 BUDGETS = (32, 64, 128)

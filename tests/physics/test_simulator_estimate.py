@@ -39,7 +39,9 @@ def a_scene(rng: np.random.Generator, domain: Domain) -> cs.Scene:
     return cs.Scene([body() for _ in range(rng.integers(1, 3))])
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "count", [pytest.param(20, marks=pytest.mark.e2e), pytest.param(500, marks=pytest.mark.slow)]
+)
 def test_it_is_that_of_weak_signals_too(pair: Pair, count: int) -> None:
     """Against a solve for a thousand times finer functions, over signals from 1e-20 to 1e-12 F."""
     sim, whole = pair
@@ -59,6 +61,7 @@ def test_it_is_that_of_weak_signals_too(pair: Pair, count: int) -> None:
     assert np.median(error[weak] / signal[weak]) < 0.01
 
 
+@pytest.mark.e2e
 def test_it_tells_of_panels_that_are_too_coarse(pair: Pair) -> None:
     """Bodies of 100 panels against 1,400: nearly all functions count, so that panels are in doubt.
 
@@ -89,6 +92,7 @@ def test_it_tells_of_panels_that_are_too_coarse(pair: Pair) -> None:
     assert max(share) < 20.0
 
 
+@pytest.mark.e2e
 def test_a_weak_signal_does_not_depend_on_what_was_read_before(pair: Pair) -> None:
     """To the last bit: a ball of 30 mm, 130 mm above the sensor, after other scenes."""
     sim, whole = pair
@@ -102,6 +106,7 @@ def test_a_weak_signal_does_not_depend_on_what_was_read_before(pair: Pair) -> No
 
 
 @pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-10])
+@pytest.mark.e2e
 def test_it_does_not_depend_on_what_a_large_body_is_tied_to(pair: Pair, grounding: object) -> None:
     """A plate of 0.3 m at ten places: errors of floating ones are estimated as well as others."""
     sim = pair[0]
@@ -142,6 +147,7 @@ def _open_shell() -> cs.TriMesh:
     ],
     ids=["inside", "touching", "near", "deep inside", "ball", "shell", "shell off", "ball off"],
 )
+@pytest.mark.e2e
 def test_an_electrode_inside_a_body_cannot_be_trusted(
     pair: Pair, shape: cs.Shape, height: float, of_steel: bool, of_wood: bool, material: str
 ) -> None:
@@ -154,6 +160,7 @@ def test_an_electrode_inside_a_body_cannot_be_trusted(
 
 @pytest.mark.parametrize("preset", ["fast", "standard"])
 @pytest.mark.parametrize("size", [(1.0, 0.6, 0.02), (2.0, 2.0, 0.1)])
+@pytest.mark.e2e
 def test_of_tables_and_floors(
     simulators: Callable[..., cs.Simulator], preset: str, size: tuple[float, float, float]
 ) -> None:

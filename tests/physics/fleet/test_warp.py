@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from approximate import approx
 from cluster_twin import same_functions, twin_of
-from reference_scenes import diagonal_errors, fleet_of, reference_scenes
 from fleet_scenes import BODIES, LONG, frames, long_poses, poses, scene
+from reference_scenes import diagonal_errors, fleet_of, reference_scenes
 
 import capsense as cs
 from capsense.errors import SceneError

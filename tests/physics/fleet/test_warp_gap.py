@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import tiny_field
 from cluster_twin import same_functions, twin_of
+from fleet_scenes import frames, scene
 from near_scenes import fleet_of, near_scenes
 from scipy.spatial.transform import Rotation
-from fleet_scenes import frames, scene
 
 import capsense as cs
 from capsense.field.cache import load_or_build

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cluster_twin import same_functions, twin_of
+from fleet_scenes import BODIES, frames, poses, scene
 from reference_scenes import fleet_of, reference_scenes
 from scipy.spatial.transform import Rotation
-from fleet_scenes import BODIES, frames, poses, scene
 
 import capsense as cs
 from capsense.design import Role, load_design
