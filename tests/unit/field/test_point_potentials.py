@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 from approximate import approx
-from solver_scenes import Array
 
 from capsense.field.green_kernels import point_potentials, source_potentials
+
+Array = np.ndarray
 
 
 def potentials(points: Array, sources: Array, floor: float, least: float) -> Array:

@@ -10,10 +10,10 @@ from approximate import approx
 from plain_leaves import plain_leaves
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
-from solver_scenes import Array
 
 from capsense.solver.interaction.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
 
+Array = np.ndarray
 DEEP = -1e5
 """A floor [m] whose images are too far away to count."""
 
