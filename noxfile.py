@@ -22,7 +22,7 @@ nox.options.reuse_existing_virtualenvs = True
 
 PYTHONS = ["3.11", "3.12", "3.13", "3.14"]
 TEST_TOOLS = "pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100"
-BOUNDS = "tests/solver/test_panel_kernels.py", "tests/field/test_bem_kernels.py"
+BOUNDS = "tests/unit/solver/test_panel_kernels.py", "tests/unit/field/test_bem_kernels.py"
 
 
 def install(session: nox.Session, *what: str) -> None:

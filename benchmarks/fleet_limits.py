@@ -19,15 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fleet"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
+from fleet import PRIMITIVES
+from fleet_scenes import LONG, long_poses, scene
 from reference_scenes import DESIGN, fleet_of, reference_scenes
 from smoothness import BODIES
-from test_fleet import LONG, long_poses, scene
 
 import capsense as cs
-from fleet import PRIMITIVES
 
 DEVICE = "warp:cpu"
 BUDGETS = (32, 64, 128)

@@ -101,7 +101,7 @@ def python_stream(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def unity_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The same by the Unity package under mono."""
-    sources = [*(ROOT / "tests/unity").glob("*.cs"), *(ROOT / "unity/Runtime").glob("*.cs")]
+    sources = [*(ROOT / "tests/e2e/unity").glob("*.cs"), *(ROOT / "unity/Runtime").glob("*.cs")]
     sources += (ROOT / "unity/Samples~").rglob("*.cs")
     with tempfile.TemporaryDirectory() as folder:
         program = f"{folder}/driver.exe"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # threads of several processes wait for one another
@@ -89,52 +90,40 @@ def foam_field(
     return foam[0]
 
 
-LAYERS = {
-    "unit": "design humans mesh plotting readout scene solver field/test_panels.py "
-    "field/test_grid.py test_constants_page.py test_jit.py test_public_api.py test_reading.py "
-    "test_scenario.py test_shared.py test_simd.py test_thread_pool.py",
-    "physics": "",  # all that is not named
-    "e2e": "adapters benchmarks cli learning recording reproduce server unity viewer "
-    "field/test_cache.py field/test_shipped.py fleet/test_autograd.py "
-    "fleet/test_genesis.py fleet/test_isaac_lab.py fleet/test_mjlab.py "
-    "fleet/test_parallel_simulators.py mesh/test_gmsh_mesher.py solver/test_soft_gap.py "
-    "test_assistive_gym_patch.py "
-    "test_contributing.py test_copies.py test_damaged.py test_examples.py test_from_the_paper.py "
-    "test_project.py "
-    "test_kernel_cache.py test_pages.py test_simulator_estimate.py test_simulator_examples.py "
-    "test_troubleshooting.py test_tutorials.py test_validation_page.py",
-}
-"""Folders and files of each layer; a mark moves a single test to a later one."""
-_PLACES = {place: layer for layer, places in LAYERS.items() for place in places.split()}
-_ORDER = [*LAYERS, "slow"]
+@pytest.fixture
+def broken_pipes_ignored() -> Iterator[None]:
+    """For tests that start Gmsh themselves: it makes a broken pipe end the process."""
+    yield
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+
+
+_ORDER = ["unit", "physics", "e2e", "slow"]
+"""Layers, which are the folders of this one, and the mark of long tests; a test may be marked with
+a later one than its folder."""
 _HERE = Path(__file__).parent
-
-
-def _layer(path: Path) -> str:
-    place = path.relative_to(_HERE)
-    return _PLACES.get(place.as_posix()) or _PLACES.get(place.parts[0]) or "physics"
 
 
 def _wanted(config: pytest.Config) -> list[str]:
     """Layers that a run may have tests of.
 
-    Without a marker expression slow tests are left out, and of the whole suite the end-to-end tests
-    as well: ``pytest tests/cli`` runs all but slow ones.
+    Without a marker expression slow tests are left out, and of the whole suite or a whole layer
+    the end-to-end tests as well, unless that layer is ``e2e``: ``pytest tests/e2e/cli`` runs all
+    but slow ones.
     """
     asked = config.option.markexpr
-    if asked in LAYERS:
+    if asked in _ORDER[:3]:
         return [asked]
     if asked or any("::" in a for a in config.args):
         return _ORDER
-    whole = [config.rootpath / a for a in config.args] in ([_HERE], [config.rootpath])
-    return ["unit", "physics"] if whole else list(LAYERS)
+    whole = {config.rootpath, _HERE, _HERE / "unit", _HERE / "physics"}
+    return _ORDER[:2] if {config.rootpath / a for a in config.args} <= whole else _ORDER[:3]
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Import no file that has only tests of later layers than those that are wanted."""
-    if collection_path.name.startswith("test_"):
+    """Import nothing of folders that have only tests of later layers than are wanted."""
+    if collection_path.parent == _HERE and collection_path.name in _ORDER:
         last = max(_ORDER.index(layer) for layer in _wanted(config))
-        if _ORDER.index(_layer(collection_path)) > last:
+        if _ORDER.index(collection_path.name) > last:
             return True
     return None
 
@@ -143,11 +132,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Give each test its layer, and leave out what was not asked for."""
     for item in items:
         own = [mark for mark in _ORDER if item.get_closest_marker(mark)]
-        layer = _layer(item.path)
+        layer = item.path.relative_to(_HERE).parts[0]
+        if layer not in _ORDER[:3]:
+            raise pytest.UsageError(f"{item.path} is in no layer: move it to unit, physics or e2e")
         if not own:
             item.add_marker(layer)
         elif _ORDER.index(own[0]) < _ORDER.index(layer):
-            raise pytest.UsageError(f"{item.nodeid} is marked {own[0]}, but its file is {layer}")
+            raise pytest.UsageError(f"{item.nodeid} is marked {own[0]}, but its folder is {layer}")
     if config.option.markexpr:
         return
     left = set(_ORDER).difference(_wanted(config))

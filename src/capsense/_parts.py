@@ -6,7 +6,7 @@ kernel that only others call all but the last is of no use; it took more than a 
 of a first reading. What is built here is what others are made of, and nothing else.
 
 It stands on Numba's inner interfaces (``numba.core.codegen``), beside the public way to replace a
-compiler's steps (``pipeline_class``). ``tests/test_jit.py`` holds results against plain Numba.
+compiler's steps (``pipeline_class``). ``tests/unit/test_jit.py`` holds results against plain Numba.
 """
 
 from __future__ import annotations

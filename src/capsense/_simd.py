@@ -16,7 +16,7 @@ time goes to: a processor with AVX-512 takes these at once, and others half by h
 Products are fused with the sum that follows wherever the processor can, and sums are taken in the
 order that is written: bits do not depend on what else is compiled.
 
-All work in compiled code only; ``tests/test_simd.py`` holds them against numpy.
+All work in compiled code only; ``tests/unit/test_simd.py`` holds them against numpy.
 """
 
 from __future__ import annotations

@@ -1,0 +1,80 @@
+"""The examples, run for real."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from approximate import approx
+
+import capsense as cs
+from capsense.scenario import play
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def test_five_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    """Six gains; by symmetry the corner electrodes gain the same, the middle ones another."""
+    runpy.run_path(str(EXAMPLES / "five_lines.py"))
+    found = re.findall(r"(E\d): ([+-][\d.]+) fF", capsys.readouterr().out)
+    gains = {name: float(value) for name, value in found}
+    assert list(gains) == ["E1", "E2", "E3", "E4", "E5", "E6"]
+    assert min(gains.values()) > 10
+    corners = [gains[k] for k in ("E1", "E3", "E4", "E6")]
+    assert corners == approx([corners[0]] * 4, abs=0.2)
+    assert gains["E2"] == approx(gains["E5"], abs=0.2)
+
+
+def test_hand_approach() -> None:
+    """The arm is felt by the electrodes in the order in which it crosses them."""
+    scenario = cs.load_scenario(EXAMPLES / "hand_approach.toml").resampled(5.0)
+    samples = list(play(scenario, cs.Simulator(scenario.design, method=scenario.method)))
+    peaks = [
+        max(samples, key=lambda s, k=k: s.reading.delta[k, k]).time  # type: ignore[misc]
+        for k in range(6)
+    ]
+    assert peaks[0] < peaks[1] < peaks[2]
+    assert peaks[3] < peaks[4] < peaks[5]
+    first, last = (np.diag(samples[k].reading.delta) for k in (0, -1))
+    np.testing.assert_allclose(first, last[::-1], rtol=0.02)  # half a turn about z
+    assert max(s.reading.delta[0, 0] for s in samples) > 100 * first[0]
+
+
+def test_steel_bar_triangle() -> None:
+    """As in the published curve: a deep dip on the line, two shallow ones on the triangle."""
+    scenario = cs.load_scenario(EXAMPLES / "steel_bar_triangle.toml").resampled(5.0)
+    trajectory = scenario.bodies[0].trajectory
+    assert trajectory is not None
+    line_ends = 0.430 / 0.116
+    apex = 0.5 * (line_ends + trajectory.duration)
+    simulator = cs.Simulator(scenario.design, method=scenario.method)
+    loss = [
+        (s.time, -s.reading.delta[0, 2] / simulator.baseline[0, 2])
+        for s in play(scenario, simulator)
+    ]
+
+    def deepest(start: float, end: float) -> float:
+        return max(v for t, v in loss if start <= t <= end)
+
+    assert 0.05 < deepest(0.0, line_ends) < 0.20
+    for start, end in ((line_ends, apex - 0.3), (apex + 0.3, trajectory.duration)):
+        assert 0.005 < deepest(start, end) < 0.3 * deepest(0.0, line_ends)
+        assert deepest(apex - 0.15, apex + 0.15) < deepest(start, end)
+    assert min(v for t, v in loss if abs(t - line_ends) < 0.2) < 0.002
+    again = trajectory.duration
+    assert deepest(again, again + line_ends) == approx(deepest(0.0, line_ends), rel=0.02)
+
+
+def test_touch_approach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fist from 200 mm to full pressure and back; the example checks itself and draws a plot."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    module = importlib.import_module("touch_approach")
+    monkeypatch.setattr(module, "RATE", 20.0)
+    record = module.main(tmp_path)
+    assert (tmp_path / "touch_approach.png").stat().st_size > 10_000
+    code = record.codes.of("press").code
+    assert code.max() - np.median(code[:5]) > 1e6

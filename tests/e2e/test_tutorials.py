@@ -1,0 +1,55 @@
+"""The tutorials, run as they stand on their pages.
+
+A line such as ``EPISODES = 20  # the tests use 2`` is run with the smaller number. Pages whose code
+has none must print what they show.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import chdir
+from pathlib import Path
+
+import pytest
+from approximate import approx
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = [DOCS / "getting_started.md", DOCS / "own_design.md", *sorted(DOCS.glob("tutorials/*.md"))]
+REDUCED = re.compile(r"^(\w+ = ).*?#.*the tests use (.*)$", flags=re.MULTILINE)
+NUMBER = re.compile(r"-?\d+(?:\.\d*)?(?:e[-+]?\d+)?")
+
+
+def blocks(page: Path, language: str) -> str:
+    """All fenced code of a language, one after another."""
+    text = page.read_text(encoding="utf-8")
+    return "\n".join(re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+def test_a_page_runs(
+    page: Path,
+    tmp_path: Path,
+    field_cache: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every block, in one namespace, in an empty folder; shown numbers hold to 3 % or a digit."""
+    monkeypatch.setenv("CAPSENSE_CACHE_DIR", str(field_cache))
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    code = blocks(page, "python")
+    reduced = REDUCED.sub(r"\1\2", code)
+    with chdir(tmp_path):
+        for name, text in files(page).items():
+            Path(name).write_text(REDUCED.sub(r"\1\2", text), encoding="utf-8")
+        exec(compile(reduced, page.name, "exec"), {"__name__": "tutorial"})
+    if reduced == code:
+        found, shown = capsys.readouterr().out, blocks(page, "text")
+        assert NUMBER.sub("#", found).split() == NUMBER.sub("#", shown).split()
+        numbers = [[float(n) for n in NUMBER.findall(text)] for text in (found, shown)]
+        assert numbers[0] == approx(numbers[1], rel=0.03, abs=0.0101)  # a last digit
+
+
+def files(page: Path) -> dict[str, str]:
+    """Files that a page shows, by the titles of their blocks."""
+    text = page.read_text(encoding="utf-8")
+    return dict(re.findall(r'```toml title="([^"]+)"\n(.*?)```', text, flags=re.DOTALL))

@@ -1,0 +1,170 @@
+"""The validation page: what it computes itself, and what it says of what has not been run."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from approximate import approx
+from benchmark_modules import imported
+
+from capsense.reproduce import STUDIES
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
+MODULES = ("validation", "validation_results")
+
+
+@pytest.fixture(scope="module")
+def parts() -> Iterator[dict[str, ModuleType]]:
+    """The benchmark's modules."""
+    with imported(*MODULES) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def validation(parts: dict[str, ModuleType], field_cache: Path) -> Iterator[ModuleType]:
+    """The script that writes the page, with the tests' fields."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CAPSENSE_CACHE_DIR", str(field_cache))
+        yield parts["validation"]
+
+
+def cells(line: str) -> list[str]:
+    """The cells of a line of a table."""
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def rows(text: str) -> dict[str, list[str]]:
+    """Lines of a table by their first cells."""
+    return {line[0]: line[1:] for line in map(cells, text.splitlines()[2:])}
+
+
+def numbers(text: str) -> list[float]:
+    """All numbers of a text, in order."""
+    return [float(n) for n in re.findall(r"[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?", text)]
+
+
+def assert_on_page(computed: str, absolute: float, relative: float = 0.02) -> None:
+    """Every line of a computed table stands on the page, with the same figures to within bounds."""
+    lines = {cells(line)[0]: line for line in PAGE.splitlines() if line.startswith("|")}
+    by_two = {tuple(cells(line)[:2]): line for line in PAGE.splitlines() if line.startswith("|")}
+    for line in computed.splitlines()[2:]:
+        own = cells(line)
+        there = by_two.get((own[0], own[1])) or lines.get(own[0])
+        assert there is not None, f"the page lacks {line}"
+        assert numbers(there) == approx(numbers(line), abs=absolute, rel=relative), line
+
+
+def test_disc_between_planes(validation: ModuleType) -> None:
+    """Analytic: half-plane edges; the online solver 5 mm from the electrode."""
+    for _, formula, found, _ in validation.disc_between_planes([0.005]):
+        assert float(found) == approx(float(formula), rel=0.02)
+
+
+def test_references(validation: ModuleType) -> None:
+    """Every packaged case has a line; errors stay within bounds, and the page tells them."""
+    text = validation.references()
+    lines = text.splitlines()
+    curved = sum("arm_segment" in line for line in lines)
+    assert curved >= 4
+    assert len(lines) == 2 + 13 + 10 + 5 + curved
+    errors = {tuple(cells(x)[:2]): numbers(cells(x)[2])[0] for x in lines[2:]}
+    near = {case for case in errors if case[1] in ("bar 1", "bar 2")}
+    assert len(near) == 2
+    assert max(errors[case] for case in near) < 2
+    assert max(error for case, error in errors.items() if case not in near) < 3
+    by_case = {tuple(cells(x)[:2]): x for x in PAGE.splitlines() if x.startswith("|")}
+    for line in lines[2:]:
+        there = cells(by_case[tuple(cells(line)[:2])])
+        assert numbers(there[2]) == approx(numbers(cells(line)[2]), abs=0.05, rel=0.02)
+
+
+def test_maps(validation: ModuleType) -> None:
+    """The standard preset over 209 scenes: within bounds, and as the page says."""
+    text = validation.presets(["standard"])
+    found = [cells(line) for line in text.splitlines()[2:]]
+    assert [int(row[2]) for row in found] == [89, 96, 24]
+    for row, (rms, worst) in zip(found, ((0.55, 2.5), (1.0, 5.5), (1.6, 12.0)), strict=True):
+        assert float(row[3]) < rms
+        assert float(row[5]) < worst
+    assert_on_page(text, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("only", "count"), [("cover", 4), pytest.param("", 11, marks=pytest.mark.slow)]
+)
+def test_designs(validation: ModuleType, only: str, count: int) -> None:
+    """Each reference is good to 0.5 %; what self mode reads, and the page says so."""
+    text = validation.designs(only)
+    found = rows(text)
+    assert len(found) == count
+    for name, (_, _, own, error) in found.items():
+        assert abs(numbers(own)[1]) < 4.0, name
+        assert numbers(error)[0] < 0.5, name
+    assert_on_page(text, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("part", "columns", "lines", "bound"),
+    [
+        ("contact", 4, 7, 50), ("wide", 9, 1, 70), ("images", 4, 6, 20), ("cloth", 4, 4, 35),
+        ("inside", 4, 5, 1000), pytest.param("wide", 9, 5, 70, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_limits(validation: ModuleType, part: str, columns: int, lines: int, bound: float) -> None:
+    """Limits are those on the page."""
+    text = validation.limited(part, *(str(k) for k in range(columns)), lines=lines)
+    assert len(rows(text)) == lines
+    for values in rows(text).values():
+        assert len(values) == columns
+        assert max(map(float, values)) < bound
+    assert_on_page(text, 0.3)
+
+
+def test_what_was_not_run_is_said(parts: dict[str, ModuleType], tmp_path: Path) -> None:
+    results = parts["validation_results"]
+    for table in (results.elements, results.smoothness, results.boards):
+        assert "Not measured in this edition: `python benchmarks/" in table(tmp_path / "none.json")
+    found = results.studies(tmp_path)
+    for name in STUDIES:
+        assert f"Not run in this edition: `capsense reproduce {name}`" in found
+
+
+def test_rows_of_a_study(parts: dict[str, ModuleType], tmp_path: Path) -> None:
+    studies = parts["validation_results"].studies
+    name = next(iter(STUDIES))
+    (tmp_path / name).mkdir()
+    row = {"what": "r", "value": 0.5, "unit": "%", "target": "> 0.4", "verdict": "met"}
+    content = {"title": "A title", "reduced": False, "rows": [row]}
+    (tmp_path / name / "rows.json").write_text(json.dumps(content), encoding="utf-8")
+    found = studies(tmp_path)
+    assert "### A title" in found
+    assert "| r | 0.5 % | > 0.4 | met |" in found
+    content["reduced"] = True
+    (tmp_path / name / "rows.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(SystemExit, match="reduced form"):
+        studies(tmp_path)
+
+
+def test_page_is_of_the_present_studies(validation: ModuleType) -> None:
+    """The page was written after the last study was added, from the present template."""
+    for name in STUDIES:
+        assert f"`capsense reproduce {name}`\n\n| what" in PAGE, f"{name} is missing: run it anew"
+    template = validation.TEMPLATE.read_text(encoding="utf-8")
+    at = 0
+    for text in re.split(r"\{\w+\}", template):
+        at = PAGE.find(text, at)
+        assert at >= 0, f"the page lacks, or has elsewhere: {text[:60]!r}"
+        at += len(text)
+
+
+def test_named_commands_are_there() -> None:
+    """Every benchmark that validation and performance name is a file."""
+    performance = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    for name in re.findall(r"benchmarks/(\w+\.py)", PAGE + performance):
+        assert (ROOT / "benchmarks" / name).is_file(), name

@@ -1,0 +1,60 @@
+"""The page on the theory lists the constants that the code has, with their values."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "benchmarks"))
+
+import constants  # noqa: E402
+
+PAGE = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
+UPDATE = "run python benchmarks/constants.py --write docs/theory.md"
+
+
+def test_every_constant_is_described() -> None:
+    """``constants.toml`` describes the constants of the code, and no others."""
+    found, notes = constants.constants(), constants.notes()
+    assert len({c.key for c in found}) == len(found)
+    assert {c.key for c in found} == set(notes), "benchmarks/constants.toml and the code differ"
+    for key, note in notes.items():
+        if note["kind"] == "tuned":
+            assert note["origin"] in constants.ORIGINS, key
+            assert {*note} <= {"kind", "unit", "meaning", "origin", "sensitivity"}, key
+        else:
+            assert set(note) == {"kind"}, key
+            assert note["kind"] in constants.OTHERS, key
+
+
+def test_the_page_lists_them() -> None:
+    """Name, module and value of every tuned constant, no others, and their number."""
+    text = PAGE.partition(constants.START)[2].partition(constants.END)[0]
+    rows = re.findall(r"^\| `([\w.]+)`<br>`([\w.]+)` \| (.*?) \|", text, re.MULTILINE)
+    notes = constants.notes()
+    tuned = [c for c in constants.constants() if notes[c.key]["kind"] == "tuned"]
+    assert rows == [(c.name, c.module, c.value) for c in tuned], UPDATE
+    assert f"**{len(rows)} constants are tuned.**" in text, UPDATE
+    assert text.strip() == constants.table(), UPDATE
+
+
+def test_what_counts_as_a_constant(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """Numbers, tuples and formulas of numbers are listed; names, texts and functions are not."""
+    for package in constants.PACKAGES:
+        (tmp_path / package).mkdir()
+    (tmp_path / "field" / "some.py").write_text(
+        "import math\nA = 1.5\n'''What\nit is.'''\n_B, C = (1, 2.0), -3\nD = 2 * math.pi\n"
+        "E = 'text'\nF = A\ng = 1.0\nH: int = 4\nI = True\n"
+        "SETS = {'fine': Preset(panels=9, x=None)}\n"
+        "class Preset:\n    panels: int = 7\n    name: str = 'a'\nclass Other:\n    size = 1.0\n",
+        encoding="utf-8",
+    )
+    monkeypatch.setattr(constants, "SOURCE", tmp_path)
+    found = constants.constants()
+    assert {c.name: c.value for c in found} == {
+        "A": "1.5", "_B": "1; 2.0", "C": "-3", "D": "2 · π", "H": "4", "SETS.fine.panels": "9",
+        "Preset.panels": "7",
+    }  # fmt: skip
+    assert found[0].text == "What it is."
