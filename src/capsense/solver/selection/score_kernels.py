@@ -52,7 +52,7 @@ def score(bodies, green, threshold, weight):
     Returns:
         The clusters that were looked at, and the row of each body's first one, shape (b + 1,).
     """
-    terminals, looks = green.terminals, room_for(0, green.phi_columns)
+    terminals, looks = green.terminals, room_for(np.int64(0), green.phi_columns)
     energy, first = np.zeros(terminals), np.zeros(bodies.shape[0] + 1, np.int64)
     coarser = max(1.0, (threshold / _USUAL) ** (1.0 / 3.0))
     for b in range(bodies.shape[0]):

@@ -52,7 +52,10 @@ class Functions(NamedTuple):
     """The charge functions of a cut: those solved for, then those of the estimate."""
 
     cluster: NDArray[Any]
-    """Cluster in the cut that a function splits, -1 - cluster for the net charge, shape (f,)."""
+    """Cluster in the cut whose charge a function is made of, shape (f,)."""
+    net: NDArray[Any]
+    """Whether it is the net charge of that cluster, a whole body; otherwise its charge is that of
+    the cluster's first part less that of the second; shape (f,)."""
     number: NDArray[Any]
     """Its number among the functions of the shape, shape (f,)."""
     body: NDArray[Any]
@@ -249,14 +252,14 @@ def functions_of(bodies, cut, beyond):
             for c in range(2):
                 reaches_out[a] = reaches_out[a] or reaches_out[cut.children[a, c]]
     cluster, number = np.empty(count, np.int64), np.empty(count, np.int64)
-    body = np.empty(count, np.int64)
+    net, body = np.zeros(count, np.bool_), np.empty(count, np.int64)
     fade, above, ends = np.empty(count), np.empty(count), np.zeros(count)
     f = solved = 0
     for rest in range(2):
         for a in range(cut.node.shape[0]):
             b = cut.body[a]
             if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral and is_there(cut, a):
-                cluster[f], number[f], body[f] = -1 - a, 0, b
+                cluster[f], net[f], number[f], body[f] = a, True, 0, b
                 fade[f] = above[f] = smooth(cut.inside_weight[a] / _FULL)
                 f += 1
             x, y = cut.children[a]
@@ -271,8 +274,8 @@ def functions_of(bodies, cut, beyond):
         if rest == 0:
             solved = f
     return Functions(
-        cluster[:f], number[:f], body[:f], fade[:f], above[:f], ends[:f], solved
-    )  # fmt: skip
+        cluster[:f], net[:f], number[:f], body[:f], fade[:f], above[:f], ends[:f], solved
+    )
 
 
 @kernel

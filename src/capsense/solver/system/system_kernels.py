@@ -90,8 +90,9 @@ def _differences(cut, functions, values, out, start):
     """
     width, zero = values.shape[1], wide_splat(np.float32(0.0))
     for f in range(out.shape[0]):
-        a, o = functions.cluster[f], f * out.shape[1] + start
-        x, y = (cut.children[a, 0], cut.children[a, 1]) if a >= 0 else (-1 - a, np.int64(-1))
+        x, y, o = functions.cluster[f], np.int64(-1), f * out.shape[1] + start
+        if not functions.net[f]:
+            x, y = cut.children[x, 0], cut.children[x, 1]
         for i in range(0, width, WIDE):
             less = wide_span(values, y * width + i) if y >= 0 else zero
             put_span(out, o + i, vsub(wide_span(values, x * width + i), less))
@@ -224,9 +225,9 @@ def _add_matter(bodies, functions, matrix, own):
     solved = functions.solved
     for f in range(functions.cluster.shape[0]):
         body = bodies[functions.body[f]]
-        if functions.cluster[f] < 0:
+        if functions.net[f]:
             for e in range(f + 1):
-                if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
+                if functions.net[e] and bodies[functions.body[e]].group == body.group:
                     matrix[f, e] += body.ground_elastance
         elif body.sheet > 0.0:
             along = SHEET * body.inverse_susceptibility / body.sheet
@@ -352,8 +353,8 @@ def leaf_charges(cut, functions, x, leaves):
     for f in range(functions.cluster.shape[0]):
         a = functions.cluster[f]
         for i in range(m):
-            if a < 0:
-                charge[-1 - a, i] += x[f, i]
+            if functions.net[f]:
+                charge[a, i] += x[f, i]
             else:
                 charge[cut.children[a, 0], i] += x[f, i]
                 charge[cut.children[a, 1], i] -= x[f, i]
