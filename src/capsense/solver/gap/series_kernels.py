@@ -26,7 +26,7 @@ from capsense._jit import compiled
 _SWEEPS = 30
 """Sweeps of Jacobi's method at most."""
 _SMALL = 1e-6
-"""Eigenvalues below this share of the largest count as so much."""
+"""Lower bound of eigenvalues, over the largest."""
 
 
 @compiled

@@ -79,7 +79,7 @@ def chosen(bodies, green, threshold, width, facing):
 
 
 class _Queue(NamedTuple):
-    """The clusters of a cut while it is made; there is room for n."""
+    """The clusters of a cut while it is made; the capacity is n."""
 
     body: NDArray[Any]
     node: NDArray[Any]
@@ -94,7 +94,7 @@ class _Queue(NamedTuple):
 
 @compiled
 def _with_room(queue, filled, more):
-    """A copy with room for some more behind those that are filled; as :func:`with_room`."""
+    """A copy with capacity for more behind those that are filled; as :func:`with_room`."""
     if filled + more <= queue.body.shape[0]:
         return queue
     n = 2 * filled + more
@@ -239,7 +239,7 @@ def functions_of(bodies, cut, beyond):
     """List the charge functions of a cut, those to be solved for first.
 
     ``beyond`` is how far each leaf is out of reach. Where one is in part, charge is held off by an
-    energy that tells nothing of how coarse panels are, so that none of its functions counts for
+    energy that does not depend on how coarse panels are, so that none of its functions counts for
     that.
     """
     count = bodies.shape[0]

@@ -61,7 +61,7 @@ class Solution(NamedTuple):
     delta: NDArray[Any]
     """Change of the Maxwell matrix [m], shape (m, m); complex where matter has losses."""
     residual_correction: NDArray[Any]
-    """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    """The part of it due to functions outside the system [m], shape (m, m)."""
     discretization_error: NDArray[Any]
     """Estimate of what panels are too coarse for, and of the gap law's error, of its diagonal [m],
     shape (m,)."""

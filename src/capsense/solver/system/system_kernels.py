@@ -37,10 +37,10 @@ from capsense.solver.selection.selection_kernels import is_there
 SHEET = 6.0
 """Impedance of a thin sheet to charge that moves from one part of a cluster to the other, times its
 thickness. It is the same for clusters of any size: with wave number k along a sheet it is 2 / (k t)
-times the energy in free space, which goes with k. The figure makes square sheets of eps 3 to 80 and
+times the energy in free space, which goes with k. The value makes square sheets of eps 3 to 80 and
 1 to 3 mm read within 30 % of boxes of that thickness, mostly within 15 %."""
 GAIN = 1.3
-"""What the functions directly below the cut stand for: themselves, and all below them."""
+"""Weight of the functions directly below the cut, which represent all below them too."""
 COARSE = 0.6
 """What panels are too coarse for, by estimate, over the energy of the functions that end in them.
 ``benchmarks/limits.py`` sets the estimate beside the errors of wide boxes near a sensor."""
@@ -73,7 +73,7 @@ class Reduced(NamedTuple):
     delta: NDArray[Any]
     """ΔC [m], shape (m, m)."""
     left: NDArray[Any]
-    """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    """The part of it due to functions outside the system [m], shape (m, m)."""
     coarse: NDArray[Any]
     """Estimate of what panels are too coarse for, of the diagonal [m], shape (m,)."""
     charge: NDArray[Any]
