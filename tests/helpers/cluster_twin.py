@@ -151,7 +151,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
-        near, fabric = near_bodies(bodies, green), np.zeros((green.terminals,) * 2)
+        near, fabric = near_bodies(bodies, green, False), np.zeros((green.terminals,) * 2)
         fabric_change(bodies, green, fabric)
         if near.any():
             bodies = bodies.copy()

@@ -2,8 +2,7 @@
 
 A panel is a planar polygon (holes allowed) that carries one surface charge density. Its edges
 are stored flat, counter-clockwise about the panel's normal for the outline, clockwise for holes.
-The closed forms are those of Wilton et al., *Potential integrals for uniform and linear source
-distributions on polygonal and polyhedral domains*, IEEE Trans. Antennas Propag. 32 (1984).
+Closed forms: :mod:`capsense.field.polygon_kernels`.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense._thread_pool import filled
+from capsense.field.polygon_kernels import polygon_gradient, polygon_potential, solid_angle
 
 Array = NDArray[np.float64]
 
-_TINY = 1e-30
 _OUTER = 1.6
 """Pairs nearer than this many sums of their diameters average the outer integral too."""
 _NEAR = 2.0
@@ -53,104 +52,6 @@ class Panels(NamedTuple):
     def areas(self) -> Array:
         """Panel areas [m²], shape (n,)."""
         return self.weights.sum(axis=1)
-
-
-@kernel
-def _edge(ends, normal, x, y, z):
-    """An edge of a polygon (2, 3), seen from a point.
-
-    Returns:
-        Its normal in the plane, outward; how far its line lies that way; where its ends lie along
-        the line; its length. The first six mean nothing where that is zero.
-    """
-    ax, ay, az = ends[0, 0], ends[0, 1], ends[0, 2]
-    lx, ly, lz = ends[1, 0] - ax, ends[1, 1] - ay, ends[1, 2] - az
-    length = math.sqrt(lx * lx + ly * ly + lz * lz)
-    lx, ly, lz = lx / length, ly / length, lz / length
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    ux, uy, uz = ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx
-    px, py, pz = ax - x, ay - y, az - z
-    low = px * lx + py * ly + pz * lz
-    return ux, uy, uz, px * ux + py * uy + pz * uz, low, low + length, length
-
-
-@kernel
-def polygon_potential(edges, normal, x, y, z):
-    """Return ∫ dS' / |r − r'| [m] over a polygon given by its edges (k, 2, 3)."""
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    d = nx * (x - edges[0, 0, 0]) + ny * (y - edges[0, 0, 1]) + nz * (z - edges[0, 0, 2])
-    h = abs(d)
-    total = 0.0
-    for e in range(edges.shape[0]):
-        _, _, _, t, lm, lp, length = _edge(edges[e], normal, x, y, z)
-        if length < 1e-15:
-            continue
-        r0 = t * t + h * h
-        if r0 < 1e-24:
-            continue
-        rp = math.sqrt(r0 + lp * lp)
-        rm = math.sqrt(r0 + lm * lm)
-        far = lm + lp > 0.0
-        log = math.log((rp + lp) / (rm + lm) if far else (rm - lm) / (rp - lp))
-        total += t * log
-        if h > 1e-12:
-            total -= h * (math.atan(t * lp / (r0 + h * rp)) - math.atan(t * lm / (r0 + h * rm)))
-    return total
-
-
-@kernel
-def polygon_gradient(edges, normal, x, y, z, out):
-    """Write ∇ ∫ dS' / |r − r'| (dimensionless) into ``out`` (3,).
-
-    On the polygon itself the normal part is the principal value, zero.
-    """
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    d = nx * (x - edges[0, 0, 0]) + ny * (y - edges[0, 0, 1]) + nz * (z - edges[0, 0, 2])
-    h = abs(d)
-    gx, gy, gz, beta = 0.0, 0.0, 0.0, 0.0
-    for e in range(edges.shape[0]):
-        ux, uy, uz, t, lm, lp, length = _edge(edges[e], normal, x, y, z)
-        if length < 1e-15:
-            continue
-        r0 = t * t + h * h + _TINY
-        rp = math.sqrt(r0 + lp * lp)
-        rm = math.sqrt(r0 + lm * lm)
-        if lm + lp > 0.0:
-            log = math.log((rp + lp) / (rm + lm + _TINY))
-        else:
-            log = math.log((rm - lm) / (rp - lp + _TINY))
-        gx -= ux * log
-        gy -= uy * log
-        gz -= uz * log
-        if h > 1e-12:
-            beta += math.atan(t * lp / (r0 + h * rp)) - math.atan(t * lm / (r0 + h * rm))
-    if h > 1e-12:
-        s = beta if d > 0 else -beta
-        gx -= nx * s
-        gy -= ny * s
-        gz -= nz * s
-    out[0], out[1], out[2] = gx, gy, gz
-
-
-@kernel
-def solid_angle(edges, normal, x, y, z):
-    """Return the solid angle of a polygon from a point, positive in front of it, zero in its plane.
-
-    It is the normal part of :func:`polygon_gradient`, with the other sign.
-    """
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    d = nx * (x - edges[0, 0, 0]) + ny * (y - edges[0, 0, 1]) + nz * (z - edges[0, 0, 2])
-    h, beta = abs(d), 0.0
-    if h <= 1e-12:
-        return 0.0
-    for e in range(edges.shape[0]):
-        _, _, _, t, lm, lp, length = _edge(edges[e], normal, x, y, z)
-        if length < 1e-15:
-            continue
-        r0 = t * t + h * h
-        rp, rm = math.sqrt(r0 + lp * lp), math.sqrt(r0 + lm * lm)
-        beta += math.atan(t * lp / (r0 + h * rp)) - math.atan(t * lm / (r0 + h * rm))
-    return beta if d > 0 else -beta
 
 
 @kernel

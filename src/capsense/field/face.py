@@ -1,7 +1,7 @@
 """The face of a design: the flat surface in front of its electrodes, or that of a bent film.
 
-All of it is told in coordinates (x, y, z) of the face: those of the sensor frame in front of a flat
-design, and those of the film (:mod:`capsense.design.film`) in front of a bent one.
+All is in coordinates (x, y, z) of the face: those of the sensor frame in front of a flat design,
+and those of the film (:mod:`capsense.design.film`) in front of a bent one.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def smooth(x):
 def outside_fraction(points, space, middle):
     """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face.
 
-    ``middle`` is room for a point, shape (3,).
+    ``middle`` is workspace for a point, shape (3,).
     """
     out, depth = 0.0, math.inf
     for i in range(3):

@@ -48,7 +48,7 @@ bodies count far beyond it (``Domain.sight``)."""
 
 
 class Level(NamedTuple):
-    """Point charges that stand for a design at some distances from it; single precision.
+    """Point charges that represent a design at some distances from it; single precision.
 
     There are a multiple of ``WIDTH``. The last of them, without charge, are far away.
     """

@@ -354,7 +354,7 @@ class CpuCore:
             at = place[: len(some)]
             soft, ties = table.inverse_susceptibility[e, at], table.ground_elastance[e, at]
             some["inverse_susceptibility"] = 0.0
-            near = near_bodies(some, green)
+            near = near_bodies(some, green, False)
             metal = near & (soft == 0.0)
             lossy = (soft.imag != 0.0).any() or (ties.imag != 0.0).any()
             out[k, s] = metal.any() and lossy

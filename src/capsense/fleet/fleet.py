@@ -76,7 +76,7 @@ class Fleet:
         SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have.
         ValueError: There is no such preset, budget or device, or the frequency or a count is not
             positive.
-        MissingDependencyError: Warp is asked for and not installed.
+        MissingDependencyError: Warp is requested and not installed.
     """
 
     def __init__(

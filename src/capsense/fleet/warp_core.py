@@ -1,4 +1,4 @@
-"""A fleet's step on Warp: room for what the kernels work with, and their launches."""
+"""A fleet's step on Warp: the workspace of the kernels, and their launches."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ class WarpCore:
         return out
 
     def _touch(self, solver: SurfaceSolver, electrodes: int) -> FleetTouch | None:
-        """Make room for the contact mechanics of the cover, if the design has one."""
+        """Allocate arrays for the contact mechanics of the cover, if the design has one."""
         if not len(solver.cover.strain):
             return None
         environments, places, sensors = self.counts
@@ -164,7 +164,7 @@ class WarpCore:
         return FleetTouch(self.room(*each), self.room(*each), self.room(*each[:2]))
 
     def _fabric(self, solver: SurfaceSolver) -> Any:
-        """Make room for a conducting fabric on the cover, if the design has one."""
+        """Allocate arrays for a conducting fabric on the cover, if the design has one."""
         soft = solver.green.gap.soft
         if soft.top == BODY:
             return None

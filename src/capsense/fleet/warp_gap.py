@@ -1,6 +1,6 @@
 """The gap law of many environments as Warp kernels: what bodies near a flat design add.
 
-The twin of these kernels is :mod:`capsense.solver.gap.gap_kernels`; what they work with is told in
+The twin of these kernels is :mod:`capsense.solver.gap.gap_kernels`; their inputs are described in
 :mod:`capsense.fleet.warp_near`. Lengths in metres, 4π eps0 = 1.
 """
 

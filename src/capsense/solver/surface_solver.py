@@ -229,7 +229,7 @@ class SurfaceSolver:
         """Return what a scene changes; ``time`` [s] is what a cover's relaxation follows.
 
         Raises:
-            SceneError: A Jacobian is asked for of what has none.
+            SceneError: A Jacobian is requested for bodies that have none.
             SolveError: Bodies lie within each other in a way that leaves no solution.
         """
         view = self.look(scene)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from capsense.design.geometry import Facet
 from capsense.field import bem_kernels as kernels
 from capsense.field.panels import Grading, Panels, concatenate, cut_facet, make_panels
+from capsense.field.polygon_kernels import polygon_gradient, polygon_potential, solid_angle
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -31,7 +32,7 @@ def square(a: float) -> np.ndarray:
 
 def gradient(edges: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
     out = np.empty(3)
-    kernels.polygon_gradient(edges, UP, x, y, z, out)
+    polygon_gradient(edges, UP, x, y, z, out)
     return out
 
 
@@ -42,7 +43,7 @@ def test_square_on_its_axis(z):
     s, h = a / 2, abs(z)
     angle = math.atan2(s * s, h * math.sqrt(2 * s * s + h * h))
     expected = 4 * (2 * s * math.asinh(s / math.sqrt(s * s + h * h)) - h * angle)
-    got = kernels.polygon_potential(square(a), UP, 0.0, 0.0, z)
+    got = polygon_potential(square(a), UP, 0.0, 0.0, z)
     assert got == approx(expected, rel=1e-9)
     if z:
         slope = -4 * math.copysign(angle, z)
@@ -57,7 +58,7 @@ def test_disc_on_its_axis():
     edges = loop([(outer * math.cos(t), outer * math.sin(t)) for t in angles])
     for z in (0.0, 0.001, 0.02, 0.1):
         expected = 2 * math.pi * (math.hypot(radius, z) - z)
-        got = kernels.polygon_potential(edges, UP, 0.0, 0.0, z)
+        got = polygon_potential(edges, UP, 0.0, 0.0, z)
         assert got == approx(expected, rel=2e-5)
         if z:
             slope = 2 * math.pi * (z / math.hypot(radius, z) - 1)
@@ -86,7 +87,7 @@ def test_triangle_by_numerical_quadrature(seed):
 
     edges = loop([tuple(c) for c in corners])
     expected = integrand(1, lambda d: 1.0)
-    assert kernels.polygon_potential(edges, UP, x, y, z) == approx(expected, rel=1e-7)
+    assert polygon_potential(edges, UP, x, y, z) == approx(expected, rel=1e-7)
     slopes = [integrand(3, lambda d, k=k: -d[k]) for k in range(3)]
     np.testing.assert_allclose(gradient(edges, x, y, z), slopes, rtol=1e-6, atol=1e-9)
 
@@ -107,11 +108,11 @@ def test_polygons_turned_and_moved_with_their_points(turn):
     edges = flat @ turn.T + shift
     for point in ((0.012, 0.006, 0.004), (0.05, -0.01, -0.02), (-0.01, 0.03, 0.0)):
         moved, out = turn @ point + shift, np.empty(3)
-        expected = kernels.polygon_potential(flat, UP, *point)
-        assert kernels.polygon_potential(edges, normal, *moved) == approx(expected, rel=1e-9)
-        kernels.polygon_gradient(edges, normal, *moved, out)
+        expected = polygon_potential(flat, UP, *point)
+        assert polygon_potential(edges, normal, *moved) == approx(expected, rel=1e-9)
+        polygon_gradient(edges, normal, *moved, out)
         np.testing.assert_allclose(out, turn @ gradient(flat, *point), rtol=0, atol=1e-9)
-        angles = kernels.solid_angle(edges, normal, *moved), kernels.solid_angle(flat, UP, *point)
+        angles = solid_angle(edges, normal, *moved), solid_angle(flat, UP, *point)
         assert angles[0] == approx(angles[1], abs=1e-9)
 
 
@@ -120,9 +121,9 @@ def test_holes_subtract():
     hole = square(0.01)[::-1, ::-1]
     frame = np.concatenate([square(0.04), hole])
     for point in ((0.0, 0.0, 0.0), (0.012, 0.003, 0.002), (0.05, -0.01, 0.01)):
-        whole = kernels.polygon_potential(square(0.04), UP, *point)
-        inner = kernels.polygon_potential(square(0.01), UP, *point)
-        got = kernels.polygon_potential(frame, UP, *point)
+        whole = polygon_potential(square(0.04), UP, *point)
+        inner = polygon_potential(square(0.01), UP, *point)
+        got = polygon_potential(frame, UP, *point)
         assert got == approx(whole - inner, rel=1e-10)
 
 
@@ -130,7 +131,7 @@ def test_potential_is_continuous_and_its_normal_slope_jumps_by_4_pi():
     """Analytic: ∂φ/∂n falls by 4π across a sheet of density 1; the principal value is zero."""
     edges = loop([(0.0, 0.0), (0.03, 0.0), (0.025, 0.02), (0.0, 0.01)])
     x, y = 0.012, 0.006
-    above, on, below = (kernels.polygon_potential(edges, UP, x, y, z) for z in (1e-9, 0.0, -1e-9))
+    above, on, below = (polygon_potential(edges, UP, x, y, z) for z in (1e-9, 0.0, -1e-9))
     assert above == approx(on, rel=1e-6)
     assert below == approx(on, rel=1e-6)
     jump = gradient(edges, x, y, 1e-7)[2] - gradient(edges, x, y, -1e-7)[2]
@@ -144,11 +145,30 @@ def test_potential_is_continuous_and_its_normal_slope_jumps_by_4_pi():
 def test_points_on_edges_and_corners_are_finite(point):
     """Invariant: corners, edges and lines through them give the limit, not NaN."""
     edges = square(0.04)
-    got = kernels.polygon_potential(edges, UP, *point, 0.0)
-    near = kernels.polygon_potential(edges, UP, point[0] - 1e-9, point[1] - 2e-9, 0.0)
+    got = polygon_potential(edges, UP, *point, 0.0)
+    near = polygon_potential(edges, UP, point[0] - 1e-9, point[1] - 2e-9, 0.0)
     assert np.isfinite(got)
     assert got == approx(near, rel=1e-5)
     assert np.isfinite(gradient(edges, *point, 0.0)).all()
+
+
+@pytest.mark.parametrize("gap", [1e-5, 1e-7, 1e-9])
+def test_potential_close_to_an_edge(gap):
+    """Analytic: of a square by the corner sums of its four parts, in forms without cancellation.
+
+    A rectangle from its corner, at height z above it: a asinh(b / √(a² + z²)) + b asinh(a /
+    √(b² + z²)) − z atan(a b / (z √(a² + b² + z²))).
+    """
+    side, z = 0.004, 0.7 * gap
+
+    def corner(a: float, b: float) -> float:
+        out = a * math.asinh(b / math.hypot(a, z)) + b * math.asinh(a / math.hypot(b, z))
+        return out - z * math.atan(a * b / (z * math.sqrt(a * a + b * b + z * z)))
+
+    x, y = 0.5 * side + gap, 0.3 * side
+    left, low, high = gap, 0.5 * side - y, 0.5 * side + y
+    expected = sum(corner(side + left, t) - corner(left, t) for t in (low, high))
+    assert polygon_potential(square(side), UP, x, y, z) == approx(expected, rel=1e-13)
 
 
 def test_quadrature_of_far_panels_matches_the_closed_form():
@@ -162,7 +182,7 @@ def test_quadrature_of_far_panels_matches_the_closed_form():
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     points = panels.centers[0] + 1.001 * reach * directions
     got = kernels.potential_matrix(points, -1e3, panels)[:, 0]
-    exact = [kernels.polygon_potential(panels.edges, UP, *p) for p in points]
+    exact = [polygon_potential(panels.edges, UP, *p) for p in points]
     np.testing.assert_allclose(got, exact, rtol=3e-4)
 
 
@@ -215,7 +235,7 @@ def slow_potential(p: Panels, j: int, r: np.ndarray) -> float:
 
     def alone(r: np.ndarray) -> float:
         if near(p, j, r):
-            return kernels.polygon_potential(*shape_of(p, j), *r)
+            return polygon_potential(*shape_of(p, j), *r)
         used = p.weights[j] > 0
         return (p.weights[j][used] / np.linalg.norm(r - p.quad[j][used], axis=1)).sum()
 
@@ -226,7 +246,7 @@ def slow_gradient(p: Panels, j: int, r: np.ndarray) -> np.ndarray:
     """Of a panel alone."""
     if near(p, j, r):
         out = np.empty(3)
-        kernels.polygon_gradient(*shape_of(p, j), *r, out)
+        polygon_gradient(*shape_of(p, j), *r, out)
         return out
     used = p.weights[j] > 0
     arm = r - p.quad[j][used]
@@ -290,9 +310,9 @@ def test_solid_angles_and_rows_of_parts(panels):
     def angle(i: int, r: np.ndarray) -> float:
         edges, normal = shape_of(panels, i)
         out = np.empty(3)
-        kernels.polygon_gradient(edges, normal, *r, out)
+        polygon_gradient(edges, normal, *r, out)
         off = abs(normal @ (r - edges[0, 0]))
-        found = kernels.solid_angle(edges, normal, *r)
+        found = solid_angle(edges, normal, *r)
         assert found == approx(-normal @ out if off > 1e-12 else 0.0, abs=1e-9)
         return found
 

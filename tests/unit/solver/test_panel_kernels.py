@@ -13,15 +13,16 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from capsense.errors import SceneError
+from capsense.field.polygon_kernels import polygon_potential, solid_angle
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere
 from capsense.solver.bodies import panel_kernels as kernels
 from capsense.solver.bodies import reference
 from capsense.solver.bodies.blocks import (
     _packed,
+    edges_of,
     flux_block,
     free_block,
     impedance,
-    panel_frames,
 )
 from capsense.solver.bodies.panels import Mirrors, SurfacePanels, panels_of, polygon_panels
 
@@ -90,7 +91,7 @@ def blocks(shape: Shape) -> tuple[SurfacePanels, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("shape", [Sphere(1.0), Box((1.0, 0.7, 0.3))], ids=repr)
 def test_potential_and_solid_angle_of_a_panel(shape):
     panels = panels_of(shape, 200)
-    frames = panel_frames(panels)
+    edges = edges_of(panels)
     rng = np.random.default_rng(3)
     for k in rng.choice(len(panels), 6, replace=False):
         size = math.sqrt(panels.areas[k])
@@ -98,14 +99,14 @@ def test_potential_and_solid_angle_of_a_panel(shape):
         corners = panels.corners[k]
         potential, field = reference.polygon_integrals(corners, points)
         for p, v, e in zip(points, potential, field, strict=True):
-            assert kernels.polygon_potential(frames[k], *p) == approx(v, rel=1e-10)
-            angle = kernels.solid_angle(frames[k], *p)
+            assert polygon_potential(edges[k], panels.normals[k], *p) == approx(v, rel=1e-10)
+            angle = solid_angle(edges[k], panels.normals[k], *p)
             assert angle == approx(e @ panels.normals[k], abs=1e-10)
         inside = 0.4 * corners[0] + 0.35 * corners[1] + 0.25 * corners[2]
         on = [inside, corners[0], 0.5 * (corners[0] + corners[1])]
         near = np.array(on) + 1e-7 * size * panels.normals[k] + 1e-7 * (inside - np.array(on))
         for p, v in zip(on, reference.polygon_integrals(corners, near)[0], strict=True):
-            assert kernels.polygon_potential(frames[k], *p) == approx(v, rel=1e-5)
+            assert polygon_potential(edges[k], panels.normals[k], *p) == approx(v, rel=1e-5)
 
 
 def test_self_terms():

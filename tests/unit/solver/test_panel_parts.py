@@ -254,8 +254,8 @@ def test_wholes_have_the_energies_that_are_stored() -> None:
     for f in range(functions.solved):
         charge = np.zeros(len(cut.node))
         a = functions.cluster[f]
-        if a < 0:
-            charge[-1 - a] = 1.0
+        if functions.net[f]:
+            charge[a] = 1.0
         else:
             charge[cut.children[a]] = 1.0, -1.0
         for c in range(len(charge)):

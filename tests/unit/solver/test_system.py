@@ -222,7 +222,7 @@ def test_energy_of_charge_along_a_sheet() -> None:
     before, after = (prepared_alone(b, 0.05)[2:] for b in (plain, thin))
     functions, solved = before[0], before[0].solved
     assert 1 < solved < len(functions.cluster)
-    wanted = np.where(functions.cluster < 0, 0.0, 6.0 / (4.0 * 2e-3))
+    wanted = np.where(functions.net, 0.0, 6.0 / (4.0 * 2e-3))
     np.testing.assert_allclose(after[1].diagonal - before[1].diagonal, wanted, atol=1e-9)
     more = after[1].matrix - before[1].matrix
     np.testing.assert_allclose(more, np.diag(wanted[:solved]), atol=1e-9)

@@ -13,6 +13,7 @@ import scipy.linalg as sl
 from numpy.typing import NDArray
 
 from capsense.errors import SceneError
+from capsense.field.polygon_kernels import solid_angle
 from capsense.solver.bodies import panel_kernels as kernels
 from capsense.solver.bodies.panels import SurfacePanels
 
@@ -157,11 +158,13 @@ def _regions(panels: SurfacePanels) -> NDArray[np.int64]:
     solid = np.flatnonzero(volume > 0)
     solid = solid[np.argsort(volume[solid], kind="stable")]
     owner = np.arange(len(volume))
-    frames = panel_frames(panels)
+    edges = edges_of(panels)
     for k in np.flatnonzero(volume <= 0):
         point = panels.centers[np.argmax(parts == k)]
         for s in solid:
-            seen = sum(kernels.solid_angle(frames[i], *point) for i in np.flatnonzero(parts == s))
+            seen = sum(
+                solid_angle(edges[i], panels.normals[i], *point) for i in np.flatnonzero(parts == s)
+            )
             if abs(seen) > 2 * math.pi:
                 owner[k] = s
                 break
@@ -174,8 +177,10 @@ class _Packed(NamedTuple):
 
     flat: Array
     """Centres, second moments xx, yy, zz, xy, xz, yz, and reaches; shape (10, n)."""
-    frames: Array
-    """Plane and edges of every panel, see :func:`panel_frames`; shape (n, 34)."""
+    edges: Array
+    """Ends of the four edges of every panel [m], shape (n, 4, 2, 3)."""
+    normals: Array
+    """Unit normals, shape (n, 3)."""
     areas: Array
     """Areas [m²], shape (n,)."""
     coarse: Array
@@ -196,30 +201,14 @@ def _packed(panels: SurfacePanels) -> _Packed:
     flat[9] = np.sqrt(1.5 * (trace + np.sqrt(np.maximum(spread, 0.0))))
     c = panels.corners
     return _Packed(
-        flat, panel_frames(panels), panels.areas, _points(c, 3), _points(c, 4, _BEND), _rim(c)
-    )
+        flat, edges_of(panels), np.ascontiguousarray(panels.normals), panels.areas,
+        _points(c, 3), _points(c, 4, _BEND), _rim(c),
+    )  # fmt: skip
 
 
-def panel_frames(panels: SurfacePanels) -> Array:
-    """Centre, axes u and v of the plane, normal (12 numbers); start, direction and length of the
-    four edges in the plane (20); twice the areas of triangles (0, 1, 2) and (0, 2, 3) (2)."""
-    edge = np.roll(panels.corners, -1, axis=1) - panels.corners
-    length = np.linalg.norm(edge, axis=2, keepdims=True)
-    u = edge[:, 0] / length[:, 0]
-    v = np.cross(panels.normals, u)
-    plane = np.stack([u, v], axis=2)
-    start = (panels.corners - panels.centers[:, None]) @ plane
-    way = (edge / np.where(length > 0, length, 1.0)) @ plane
-    b, c, d = (start[:, k] - start[:, 0] for k in (1, 2, 3))
-    return np.concatenate(
-        [
-            np.concatenate([panels.centers, u, v, panels.normals], axis=1),
-            np.concatenate([start, way, length], axis=2).reshape(len(panels), 20),
-            (b[:, :1] * c[:, 1:] - b[:, 1:] * c[:, :1]),
-            (c[:, :1] * d[:, 1:] - c[:, 1:] * d[:, :1]),
-        ],
-        axis=1,
-    )
+def edges_of(panels: SurfacePanels) -> Array:
+    """Ends of the four edges of every panel [m], shape (n, 4, 2, 3)."""
+    return np.stack([panels.corners, np.roll(panels.corners, -1, axis=1)], axis=2)
 
 
 def _line(order: int, bend: float) -> tuple[Array, Array]:

@@ -106,7 +106,7 @@ def nearest(body, x, y, z, out, room):
         x, y, z: The point [m].
         out: Filled with the nearest point [m] and up to two normals of faces that meet there,
             outwards, shape (9,).
-        room: Room to work in, shape (140,).
+        room: Workspace, shape (140,).
 
     Returns:
         The distance [m], negative inside; and how many normals there are: one on a face, two at an

@@ -1,10 +1,9 @@
 """Compiled kernels: mutual potentials and fluxes of flat panels that carry even charge.
 
-Lengths in metres, 4π eps0 = 1. A panel is a row of ``frames``: its centre, the two axes of its
-plane and its normal (twelve numbers), then for each of its four edges the start (u, v) in its
-plane, the unit direction and the length (twenty), then twice the areas of the triangles (0, 1, 2)
-and (0, 2, 3) of its corners. ``flat`` (10, n) holds centre, second moments xx, yy, zz, xy, xz, yz
-and reach of all panels, ``coarse`` and ``fine`` (n, q, 4) points and weights on them.
+Lengths in metres, 4π eps0 = 1. Panels are given by the ends of their four ``edges`` (n, 4, 2, 3)
+and their ``normals`` (n, 3), see :mod:`capsense.field.polygon_kernels`. ``flat`` (10, n) holds
+centre, second moments xx, yy, zz, xy, xz, yz and reach of all panels, ``coarse`` and ``fine``
+(n, q, 4) points and weights on them.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import math
 import numpy as np
 
 from capsense._dense import three
-from capsense._jit import compiled, kernel
+from capsense._jit import kernel
 from capsense._simd import (
     dot,
     rsqrt,
@@ -28,6 +27,7 @@ from capsense._simd import (
     wide_span,
     wide_splat,
 )
+from capsense.field.polygon_kernels import polygon_potential, solid_angle
 
 NEAR = 2.2
 """Pairs nearer than this many sums of their reaches are integrated in closed form."""
@@ -40,79 +40,13 @@ atanf."""
 
 
 @kernel
-def polygon_potential(frame, x, y, z):
-    """Return ∫ dS' / |r − r'| [m] over one panel.
-
-    Sum over edges of distance times logarithm, less height times solid angle (Wilton et al.,
-    *Potential integrals for uniform and linear source distributions on polygonal and polyhedral
-    domains*, IEEE Trans. Antennas Propag. 32, 1984). The solid angle is that of two triangles
-    (van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983).
-    """
-    x -= frame[0]
-    y -= frame[1]
-    z -= frame[2]
-    u = x * frame[3] + y * frame[4] + z * frame[5]
-    v = x * frame[6] + y * frame[7] + z * frame[8]
-    w = abs(x * frame[9] + y * frame[10] + z * frame[11])
-    w2 = w * w
-    ax, ay = frame[12] - u, frame[13] - v
-    bx, by = frame[17] - u, frame[18] - v
-    cx, cy = frame[22] - u, frame[23] - v
-    dx, dy = frame[27] - u, frame[28] - v
-    a = math.sqrt(ax * ax + ay * ay + w2)
-    b = math.sqrt(bx * bx + by * by + w2)
-    c = math.sqrt(cx * cx + cy * cy + w2)
-    d = math.sqrt(dx * dx + dy * dy + w2)
-    total = _edge(ax, ay, frame[14], frame[15], frame[16], a + b)
-    total += _edge(bx, by, frame[19], frame[20], frame[21], b + c)
-    total += _edge(cx, cy, frame[24], frame[25], frame[26], c + d)
-    total += _edge(dx, dy, frame[29], frame[30], frame[31], d + a)
-    ac = ax * cx + ay * cy + w2
-    p = c * (a * b + ax * bx + ay * by + w2) + a * (bx * cx + by * cy + w2) + ac * b
-    q = d * (a * c + ac) + a * (cx * dx + cy * dy + w2) + c * (ax * dx + ay * dy + w2)
-    s, t = w * frame[32], w * frame[33]
-    return total - 2.0 * w * math.atan2(s * q + t * p, p * q - s * t)
-
-
-@compiled
-def _edge(x, y, ex, ey, length, ends):
-    """Distance of an edge in the plane times ∫ dl / r along it; (x, y) is its start."""
-    return (x * ey - y * ex) * math.log((ends + length + _TINY) / (abs(ends - length) + _TINY))
-
-
-@kernel
-def solid_angle(frame, x, y, z):
-    """Return the angle [sr] under which a point sees one panel, positive from its normal's side."""
-    x -= frame[0]
-    y -= frame[1]
-    z -= frame[2]
-    u = x * frame[3] + y * frame[4] + z * frame[5]
-    v = x * frame[6] + y * frame[7] + z * frame[8]
-    w = x * frame[9] + y * frame[10] + z * frame[11]
-    w2 = w * w
-    ax, ay = frame[12] - u, frame[13] - v
-    bx, by = frame[17] - u, frame[18] - v
-    cx, cy = frame[22] - u, frame[23] - v
-    dx, dy = frame[27] - u, frame[28] - v
-    a = math.sqrt(ax * ax + ay * ay + w2)
-    b = math.sqrt(bx * bx + by * by + w2)
-    c = math.sqrt(cx * cx + cy * cy + w2)
-    d = math.sqrt(dx * dx + dy * dy + w2)
-    ac = ax * cx + ay * cy + w2
-    p = c * (a * b + ax * bx + ay * by + w2) + a * (bx * cx + by * cy + w2) + ac * b
-    q = d * (a * c + ac) + a * (cx * dx + cy * dy + w2) + c * (ax * dx + ay * dy + w2)
-    s, t = w * frame[32], w * frame[33]
-    return 2.0 * math.atan2(s * q + t * p, p * q - s * t)
-
-
-@kernel
-def _mean_potential(points, frame):
+def _mean_potential(points, edges, normal):
     """Mean of the potential of one panel over weighted points (q, 4), times the panel's area."""
     total = 0.0
     for k in range(points.shape[0]):
         if points[k, 3] != 0.0:
             total += points[k, 3] * polygon_potential(
-                frame, points[k, 0], points[k, 1], points[k, 2]
+                edges, normal, points[k, 0], points[k, 1], points[k, 2]
             )
     return total
 
@@ -125,7 +59,7 @@ def fill_free(panels, mirrors, out):
     over points of the other, both ways, weighted with the fourth power of the other's reach. The
     mirror images of a pair are copied.
     """
-    flat, frames, areas = panels.flat, panels.frames, panels.areas
+    flat, edges, normals, areas = panels.flat, panels.edges, panels.normals, panels.areas
     coarse, fine, rim = panels.coarse, panels.fine, panels.rim
     image, first, by = mirrors
     n = areas.shape[0]
@@ -147,7 +81,7 @@ def fill_free(panels, mirrors, out):
             second = 3.0 * (x * x * axx + y * y * ayy + z * z * azz + 2.0 * mix) / r2
             line[j] = (1.0 + (second - axx - ayy - azz) / (2.0 * r2)) / math.sqrt(r2)
         reach = flat[9, i]
-        line[i] = _mean_potential(rim[i], frames[i]) / areas[i]
+        line[i] = _mean_potential(rim[i], edges[i], normals[i]) / areas[i]
         for j in range(n):
             if first[j] < i:  # an image of a pair of that row
                 line[j] = out[first[j], image[by[j], i]]
@@ -165,7 +99,8 @@ def fill_free(panels, mirrors, out):
                 if r2 < NEAR * NEAR * span * span:
                     small, large = (j, i) if flat[9, j] < (1.0 + 1e-6) * reach else (i, j)
                     rule = fine if r2 < TOUCHING * TOUCHING * span * span else coarse
-                    line[j] = _mean_potential(rule[small], frames[large]) / areas[large]
+                    value = _mean_potential(rule[small], edges[large], normals[large])
+                    line[j] = value / areas[large]
 
 
 @kernel
@@ -176,14 +111,14 @@ def fill_flux(panels, out):
     through a closed surface add up to 2π for every point on it. Near pairs average that over
     points of l, far pairs take the field of point charges and second moments.
     """
-    flat, frames, areas = panels.flat, panels.frames, panels.areas
+    flat, edges, normals, areas = panels.flat, panels.edges, panels.normals, panels.areas
     coarse, fine = panels.coarse, panels.fine
     n = areas.shape[0]
     for k in range(n):
         x0, y0, z0 = flat[0, k], flat[1, k], flat[2, k]
         xx, yy, zz = flat[3, k], flat[4, k], flat[5, k]
         xy, xz, yz = flat[6, k], flat[7, k], flat[8, k]
-        nx, ny, nz = frames[k, 9], frames[k, 10], frames[k, 11]
+        nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
         area = areas[k]
         for j in range(n):
             x, y, z = x0 - flat[0, j], y0 - flat[1, j], z0 - flat[2, j]
@@ -208,7 +143,7 @@ def fill_flux(panels, out):
                 value = 0.0
                 for q in range(rule.shape[1]):
                     p = rule[j, q]
-                    value -= p[3] * solid_angle(frames[k], p[0], p[1], p[2])
+                    value -= p[3] * solid_angle(edges[k], normals[k], p[0], p[1], p[2])
                 out[k, j] = value
         out[k, k] = 0.0
 

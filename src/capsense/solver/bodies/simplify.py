@@ -290,7 +290,7 @@ def _step(vertices: Array, faces: Index, points: Array, normals: Array, weights:
 
 
 _FACING = 0.5
-"""Least cosine between normals of a surface and of a triangle that stands for it."""
+"""Least cosine between normals of a surface and of a triangle that replaces it."""
 
 
 @kernel

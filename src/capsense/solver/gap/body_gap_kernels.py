@@ -289,7 +289,7 @@ def _move_apart(true, out, other, length, box, facing):
     """Move a point away from another body [m].
 
     Args:
-        true: Where it is, which tells how far, shape (3,).
+        true: Where it is, for the distance, shape (3,).
         out: What is moved, shape (3,).
         other: The body.
         length: See :class:`Facing`.

@@ -38,7 +38,7 @@ WAYS, EXACT = 30, 1e-4
 
 
 @compiled
-def near_bodies(bodies, green, dielectric=False):
+def near_bodies(bodies, green, dielectric):
     """Conductors, or dielectrics, with an outline that may be within twice h0 of a face, (b,).
 
     Not bodies that are mostly behind the face, nor those from the floor of the domain to its
@@ -99,7 +99,7 @@ def press_out(bodies, near, green):
         x, y, z = bodies[b].position[0], bodies[b].position[1], bodies[b].position[2]
         if gap.curvature == 0.0:
             z = gap.top
-        nearest(bodies[b], x - far * u, y, z - far * w, point, room)
+        _nearest(bodies[b], x - far * u, y, z - far * w, point, room)
         x, y, z = on_face(point[0], point[1], point[2], gap.curvature)
         if _faces_cell(x, y, gap):  # the lowest point
             deepest = max(0.0, gap.top - z)
@@ -107,7 +107,7 @@ def press_out(bodies, near, green):
             x, y, z = off_face(
                 gap.block_center[k, 0], gap.block_center[k, 1], gap.top, gap.curvature
             )
-            off, _ = nearest(bodies[b], x, y, z, point, room)
+            off, _ = _nearest(bodies[b], x, y, z, point, room)
             if off > gap.block_radius[k] or gap.terminal[gap.blocks[k]] < 0:
                 continue
             for c in range(gap.blocks[k], gap.blocks[k + 1]):
@@ -116,7 +116,7 @@ def press_out(bodies, near, green):
                 )
                 depth = 0.0
                 for _ in range(WAYS):  # down to where the surface is
-                    off, _ = nearest(bodies[b], x - depth * u, y, z - depth * w, point, room)
+                    off, _ = _nearest(bodies[b], x - depth * u, y, z - depth * w, point, room)
                     if off >= -EXACT * gap.validity:
                         break
                     depth -= off
@@ -153,16 +153,16 @@ def local_change(bodies, near, node, green, matrix):
         matrix: Added to, shape (t, t).
     """
     gap = green.gap
-    chosen, count = np.empty(bodies.shape[0], np.int64), 0
+    chosen, count = np.empty(bodies.shape[0], np.int64), np.int64(0)
     point, room, moved = np.empty(9), np.empty(140), np.empty((1, 3))
     for k in range(gap.block_radius.shape[0]):
         x, y, z = off_face(gap.block_center[k, 0], gap.block_center[k, 1], gap.top, gap.curvature)
-        grounded, count = gap.terminal[gap.blocks[k]] < 0, 0
+        grounded, count = gap.terminal[gap.blocks[k]] < 0, np.int64(0)
         for b in range(bodies.shape[0]):
             if near[b] and (node[b] >= 0 or not grounded):
                 sunk = bodies[b].sunk
                 reach = REACH[1] * (gap.validity + sunk) + gap.block_radius[k]
-                off, _ = nearest(bodies[b], x, y, z + sunk, point, room)
+                off, _ = _nearest(bodies[b], x, y, z + sunk, point, room)
                 if off < reach:
                     chosen[count] = b
                     count += 1
@@ -172,6 +172,12 @@ def local_change(bodies, near, node, green, matrix):
             _add_cell(bodies, chosen, count, node, green, c, (point, room, moved), matrix)
             if gap.soft.top == BODY and gap.soft.below[c] >= 0.0:
                 _add_compressed(bodies, chosen, count, node, gap, c, (point, room), matrix)
+
+
+@kernel
+def _nearest(body, x, y, z, point, room):
+    """As :func:`nearest`, which is thus compiled for one precision of the coordinates."""
+    return nearest(body, np.float64(x), np.float64(y), np.float64(z), point, room)
 
 
 @kernel
@@ -235,7 +241,7 @@ def compressed_length(bodies, chosen, count, gap, x, y, work):
     length, at = soft.thickness, -1
     for k in range(count):
         bottom = soft.bottom + bodies[chosen[k]].sunk
-        off, _ = nearest(bodies[chosen[k]], x, y, bottom, point, room)
+        off, _ = _nearest(bodies[chosen[k]], x, y, bottom, point, room)
         if off < length:
             if off > 0.0:
                 dx, dy = point[0] - x, point[1] - y
@@ -253,12 +259,12 @@ def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
     place = off_face(x, y, z, gap.curvature)
     best, lifted, body = math.inf, math.inf, -1
     for k in range(count):
-        off, faces = nearest(bodies[chosen[k]], place[0], place[1], place[2], point, room)
+        off, faces = _nearest(bodies[chosen[k]], place[0], place[1], place[2], point, room)
         _turn_onto_face(point, gap.curvature)
         true, high = lengths(off, faces, point, x, y, green, moved)
         sunk = bodies[chosen[k]].sunk
         if sunk > 0.0:  # it stands lower than where it is solved for
-            off, faces = nearest(bodies[chosen[k]], x, y, z + sunk, point, room)
+            off, faces = _nearest(bodies[chosen[k]], x, y, z + sunk, point, room)
             point[2] -= sunk
             true, _ = lengths(off, faces, point, x, y, green, moved)
         if true < best:
@@ -310,7 +316,7 @@ def fabric_change(bodies, green, matrix):
     gap, soft = green.gap, green.gap.soft
     if soft.top == BODY:
         return
-    chosen, count = np.empty(bodies.shape[0], np.int64), 0
+    chosen, count = np.empty(bodies.shape[0], np.int64), np.int64(0)
     for b in range(bodies.shape[0]):
         if bodies[b].outline != 0:
             middle = middle_height(bodies[b])

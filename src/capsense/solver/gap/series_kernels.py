@@ -26,7 +26,7 @@ from capsense._jit import compiled
 _SWEEPS = 30
 """Sweeps of Jacobi's method at most."""
 _SMALL = 1e-6
-"""Eigenvalues below this share of the largest count as so much."""
+"""Lower bound of eigenvalues, over the largest."""
 
 
 @compiled
@@ -45,42 +45,55 @@ def in_series(
     """
     m = dielectric.shape[0]
     value, vector = eigen(lifted)
-    largest = max(value.max(), 0.0)
+    largest = 0.0
+    for i in range(m):
+        largest = max(largest, value[i])
     if largest == 0.0:
         return dielectric.copy()
-    root = np.sqrt(np.maximum(value, _SMALL * largest))
-    base = vector / root  # lifted becomes 1
-    share, turn = eigen(_product(_product(base.T.copy(), dielectric), base))
-    share = np.minimum(np.maximum(share, _SMALL), 1.0)
+    root, inverse = np.empty(m), np.empty(m)
+    for i in range(m):
+        root[i] = math.sqrt(max(value[i], _SMALL * largest))
+        inverse[i] = 1.0 / root[i]
+    base = _scaled(vector, inverse)  # lifted becomes 1
+    share, turn = eigen(_congruent(dielectric, base))
     base = _product(base, turn)
-    back = _product(turn.T.copy(), (vector * root).T.copy())
-    inside = np.sqrt(1.0 / share - 1.0)
-    more = _positive_part(_product(_product(base.T.copy(), conductor - lifted), base))
-    added = _behind(np.eye(m) + more, inside)
-    same = _behind(np.eye(m), inside)  # D, but for what was bounded
-    out = _product(_product(back.T.copy(), added - same), back)
-    return dielectric + 0.5 * (out + out.T)
+    back = _product(_transposed(turn), _transposed(_scaled(vector, root)))
+    inside = np.empty(m)
+    for i in range(m):
+        inside[i] = math.sqrt(1.0 / min(max(share[i], _SMALL), 1.0) - 1.0)
+    more = _positive_part(_congruent(difference(conductor, lifted), base))
+    one = _identity(m)
+    for i in range(m):
+        more[i, i] += 1.0
+    added = _behind(more, inside)
+    same = _behind(one, inside)  # D, but for what was bounded
+    change, out = _congruent(difference(added, same), back), np.empty((m, m))
+    for i in range(m):
+        for j in range(m):
+            out[i, j] = dielectric[i, j] + 0.5 * (change[i, j] + change[j, i])
+    return out
 
 
 @compiled
 def _behind(front: NDArray[Any], inside: NDArray[Any]) -> NDArray[Any]:
     """(front⁻¹ + diag(inside²))⁻¹ without an inverse of ``front``, which may be singular."""
     m = front.shape[0]
-    half = front * inside  # by columns
-    matrix = np.eye(m)
+    half, matrix = _scaled(front, inside), _identity(m)
     for i in range(m):
         for j in range(m):
             matrix[i, j] += inside[i] * half[i, j]
-    side = half.T.copy()
+    side = _transposed(half)
     eliminate(matrix, side)
-    return front - _product(half, side)
+    return difference(front, _product(half, side))
 
 
 @compiled
 def _positive_part(matrix: NDArray[Any]) -> NDArray[Any]:
     """A symmetric matrix without its negative eigenvalues."""
     value, vector = eigen(matrix)
-    return _product(vector * np.maximum(value, 0.0), vector.T.copy())
+    for i in range(value.shape[0]):
+        value[i] = max(value[i], 0.0)
+    return _product(_scaled(vector, value), _transposed(vector))
 
 
 @compiled
@@ -89,11 +102,11 @@ def eigen(matrix: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
     Golub and Van Loan, *Matrix Computations*, section 8.5.
     """
-    a, m = 0.5 * (matrix + matrix.T), matrix.shape[0]
-    vector = np.eye(m)
-    scale = 0.0
+    m, scale = matrix.shape[0], 0.0
+    a, vector, value = np.empty((m, m)), _identity(m), np.empty(m)
     for i in range(m):
         for j in range(m):
+            a[i, j] = 0.5 * (matrix[i, j] + matrix[j, i])
             scale = max(scale, abs(a[i, j]))
     for _ in range(_SWEEPS):
         most = 0.0
@@ -117,7 +130,57 @@ def eigen(matrix: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
                     vector[k, p], vector[k, q] = c * x - s * y, s * x + c * y
         if most <= 1e-14 * scale:
             break
-    return np.diag(a).copy(), vector
+    for i in range(m):
+        value[i] = a[i, i]
+    return value, vector
+
+
+# Loops, not array expressions: Numba's overloads of these take seconds of a first reading.
+
+
+@compiled
+def _identity(m: int) -> NDArray[Any]:
+    """The unit matrix, shape (m, m)."""
+    out = np.zeros((m, m))
+    for i in range(m):
+        out[i, i] = 1.0
+    return out
+
+
+@compiled
+def _transposed(matrix: NDArray[Any]) -> NDArray[Any]:
+    """A copy of a matrix with rows and columns exchanged."""
+    out = np.empty((matrix.shape[1], matrix.shape[0]))
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[j, i] = matrix[i, j]
+    return out
+
+
+@compiled
+def _scaled(matrix: NDArray[Any], factor: NDArray[Any]) -> NDArray[Any]:
+    """A copy of a matrix with each column times its factor."""
+    out = np.empty(matrix.shape)
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[i, j] = matrix[i, j] * factor[j]
+    return out
+
+
+@compiled
+def difference(left: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
+    """``left - right``."""
+    out = np.empty(left.shape)
+    for i in range(left.shape[0]):
+        for j in range(left.shape[1]):
+            out[i, j] = left[i, j] - right[i, j]
+    return out
+
+
+@compiled
+def _congruent(matrix: NDArray[Any], base: NDArray[Any]) -> NDArray[Any]:
+    """``base.T @ matrix @ base``."""
+    return _product(_product(_transposed(base), matrix), base)
 
 
 @compiled

@@ -258,7 +258,7 @@ def near_pairs(points, others, soft, i, own, weight, near, line):
     """Add force and torque on cluster i by clusters without weight, point by point, but those from
     own[0] to own[1].
 
-    ``near`` (14, l) is room for their points, bounds and numbers; ``line`` has shape (6, l).
+    ``near`` (14, l) is workspace for their points, bounds and numbers; ``line`` has shape (6, l).
     """
     start, stop = own
     sign = np.float32(-1.0 if stop > start else 1.0)

@@ -201,12 +201,12 @@ def _within_reach(cut, span, index, functions, of, rows):
                 for i in range(width):
                     line[i] += cut.child_weights[a, c] * more[part, i]
     for f in range(of.shape[0]):
-        a = functions.cluster[of[f]]
-        own = rows[index[a - first] if a >= 0 else 0]
+        a, net = functions.cluster[of[f]], functions.net[of[f]]
+        own = rows[0 if net else index[a - first]]
         for i in range(width):
             out[f, i] = own[i]
-        for c in range(2 if a >= 0 else 1):
-            part = (cut.children[a, c] if a >= 0 else -1 - a) - first
+        for c in range(1 if net else 2):
+            part = (a if net else cut.children[a, c]) - first
             sign = 1.0 - 2.0 * c
             if changed[part]:
                 for i in range(width):

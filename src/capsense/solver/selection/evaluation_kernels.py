@@ -41,7 +41,7 @@ second those of the table."""
 class ClusterEvaluation(NamedTuple):
     """The clusters that were looked at: those of each body, wholes first; then parts of panels.
 
-    There is room for n, of which only so many are filled as were looked at.
+    The capacity is n; the rows of evaluated clusters are filled.
     """
 
     node: NDArray[Any]
@@ -84,7 +84,7 @@ def room_for(count, phi_columns):
 
 @compiled
 def with_room(looks, filled, more):
-    """A copy with room for some more behind the rows that are filled.
+    """A copy with capacity for more rows behind the filled ones.
 
     Room for all clusters of a scene may take a hundred megabytes, which the system would hand out
     anew at each step.
@@ -118,7 +118,7 @@ def face_distance(point, space):
 def place(body, space, k, points, found, middle):
     """Place the middle of cluster k in row ``found`` of ``points`` (n, 3).
 
-    ``middle`` is room for a point, shape (3,).
+    ``middle`` is workspace for a point, shape (3,).
 
     Returns:
         Square of its distance from the design [m²]; how high above its box it is [m]; how far it is

@@ -22,7 +22,7 @@ DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 _CROSSED = 0.3
 """Least score of large clusters that cross a wall: so much that functions are fully faded in. Their
-points lie among the sources that stand for the wall, 40 mm behind it, and would attract themselves
+points lie among the sources that represent the wall, 40 mm behind it, and would attract themselves
 so much that no definite matrix were left."""
 _FULLY = 2.5
 """Functions are fully faded in from so many times the threshold on, with all presets."""
@@ -52,7 +52,7 @@ def score(bodies, green, threshold, weight):
     Returns:
         The clusters that were looked at, and the row of each body's first one, shape (b + 1,).
     """
-    terminals, looks = green.terminals, room_for(0, green.phi_columns)
+    terminals, looks = green.terminals, room_for(np.int64(0), green.phi_columns)
     energy, first = np.zeros(terminals), np.zeros(bodies.shape[0] + 1, np.int64)
     coarser = max(1.0, (threshold / _USUAL) ** (1.0 / 3.0))
     for b in range(bodies.shape[0]):
@@ -177,7 +177,7 @@ def _raise_scores(body, looks, rows, weight, counts):
 
     No charge is beyond a wall. A part that crosses one can carry charge where it is inside only if
     it is split too, which its own score does not tell. So that is at least the score of the body,
-    times the part's share of its length. ``counts``, one for each, is room to work in.
+    times the part's share of its length. ``counts``, one for each, is workspace.
     """
     children, extent, (start, stop) = integers(body.children), doubles(body.extent), rows
     scores, crossing = looks.score, looks.wall_crossing_weight

@@ -52,7 +52,10 @@ class Functions(NamedTuple):
     """The charge functions of a cut: those solved for, then those of the estimate."""
 
     cluster: NDArray[Any]
-    """Cluster in the cut that a function splits, -1 - cluster for the net charge, shape (f,)."""
+    """Cluster in the cut whose charge a function is made of, shape (f,)."""
+    net: NDArray[Any]
+    """Whether it is the net charge of that cluster, a whole body; otherwise its charge is that of
+    the cluster's first part less that of the second; shape (f,)."""
     number: NDArray[Any]
     """Its number among the functions of the shape, shape (f,)."""
     body: NDArray[Any]
@@ -76,7 +79,7 @@ def chosen(bodies, green, threshold, width, facing):
 
 
 class _Queue(NamedTuple):
-    """The clusters of a cut while it is made; there is room for n."""
+    """The clusters of a cut while it is made; the capacity is n."""
 
     body: NDArray[Any]
     node: NDArray[Any]
@@ -91,7 +94,7 @@ class _Queue(NamedTuple):
 
 @compiled
 def _with_room(queue, filled, more):
-    """A copy with room for some more behind those that are filled; as :func:`with_room`."""
+    """A copy with capacity for more behind those that are filled; as :func:`with_room`."""
     if filled + more <= queue.body.shape[0]:
         return queue
     n = 2 * filled + more
@@ -236,7 +239,7 @@ def functions_of(bodies, cut, beyond):
     """List the charge functions of a cut, those to be solved for first.
 
     ``beyond`` is how far each leaf is out of reach. Where one is in part, charge is held off by an
-    energy that tells nothing of how coarse panels are, so that none of its functions counts for
+    energy that does not depend on how coarse panels are, so that none of its functions counts for
     that.
     """
     count = bodies.shape[0]
@@ -249,14 +252,14 @@ def functions_of(bodies, cut, beyond):
             for c in range(2):
                 reaches_out[a] = reaches_out[a] or reaches_out[cut.children[a, c]]
     cluster, number = np.empty(count, np.int64), np.empty(count, np.int64)
-    body = np.empty(count, np.int64)
+    net, body = np.zeros(count, np.bool_), np.empty(count, np.int64)
     fade, above, ends = np.empty(count), np.empty(count), np.zeros(count)
     f = solved = 0
     for rest in range(2):
         for a in range(cut.node.shape[0]):
             b = cut.body[a]
             if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral and is_there(cut, a):
-                cluster[f], number[f], body[f] = -1 - a, 0, b
+                cluster[f], net[f], number[f], body[f] = a, True, 0, b
                 fade[f] = above[f] = smooth(cut.inside_weight[a] / _FULL)
                 f += 1
             x, y = cut.children[a]
@@ -271,8 +274,8 @@ def functions_of(bodies, cut, beyond):
         if rest == 0:
             solved = f
     return Functions(
-        cluster[:f], number[:f], body[:f], fade[:f], above[:f], ends[:f], solved
-    )  # fmt: skip
+        cluster[:f], net[:f], number[:f], body[:f], fade[:f], above[:f], ends[:f], solved
+    )
 
 
 @kernel

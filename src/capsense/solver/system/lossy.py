@@ -85,7 +85,7 @@ def _lossy_lifted(
     matrix = np.concatenate([real, below]).astype(complex)
     matrix += factor[:, None] * np.concatenate([inside.matrix - real, inside.rest - below])
     diagonal = own + factor * (inside.diagonal - own)
-    net = functions.cluster < 0
+    net = functions.net
     for b in range(len(records)):
         root = np.flatnonzero((functions.body == b) & net)
         others = np.flatnonzero(net & (records["group"][functions.body] == records["group"][b]))

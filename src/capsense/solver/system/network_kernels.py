@@ -50,7 +50,7 @@ def with_nodes(system, functions, node, terminals, nodes):
     for f in range(total):
         for i in range(terminals):
             phi[f, i] = system.phi[f, i]
-        if functions.cluster[f] < 0 and node[functions.body[f]] >= 0:
+        if functions.net[f] and node[functions.body[f]] >= 0:
             phi[f, node[functions.body[f]]] = -1.0
     return System(phi, system.matrix, system.rest, system.diagonal)
 

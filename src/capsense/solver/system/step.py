@@ -22,7 +22,7 @@ from capsense.solver.gap.gap_kernels import (
     near_bodies,
     press_out,
 )
-from capsense.solver.gap.series_kernels import in_series
+from capsense.solver.gap.series_kernels import difference, in_series
 from capsense.solver.gradients.gradient_kernels import jacobian
 from capsense.solver.interaction.pair_kernels import bound_images, leaf_pairs
 from capsense.solver.interaction.subpanel_kernels import add_parts
@@ -61,7 +61,7 @@ class Solution(NamedTuple):
     delta: NDArray[Any]
     """Change of the Maxwell matrix [m], shape (m, m); complex where matter has losses."""
     residual_correction: NDArray[Any]
-    """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    """The part of it due to functions outside the system [m], shape (m, m)."""
     discretization_error: NDArray[Any]
     """Estimate of what panels are too coarse for, and of the gap law's error, of its diagonal [m],
     shape (m,)."""
@@ -168,32 +168,36 @@ def _solve(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
 ) -> Solution:
     """As :func:`solve`, but for a fabric on the cover."""
-    soft = near_bodies(bodies, green, True)
+    soft = near_bodies(bodies, green, np.bool_(True))
     if not soft.any():
         return solve_lifted(bodies, green, threshold, width, adjoint)
     bodies = bodies.copy()
     press_out(bodies, soft, green)
     found = solve_lifted(bodies, green, threshold, width, adjoint)
-    rest = np.zeros(found.delta.shape)
+    m, plain = green.terminals, np.bool_(False)  # the literal would compile another version
+    rest = np.zeros((m, m))
     stiff = bodies.copy()
     if not soft.all():
         for b in range(bodies.shape[0]):
             if soft[b]:
                 stiff[b].inverse_susceptibility = NOTHING
-        rest = solve_lifted(stiff, green, threshold, width, False).delta
+        rest = solve_lifted(stiff, green, threshold, width, plain).delta
     for b in range(bodies.shape[0]):
         if soft[b]:
             stiff[b].inverse_susceptibility = 0.0
-    high = solve_lifted(stiff, green, threshold, width, False).delta
+    high = solve_lifted(stiff, green, threshold, width, plain).delta
     for b in range(bodies.shape[0]):
         if soft[b]:
             stiff[b].outline = 0  # lifted, and nothing is added
-    low = solve_lifted(stiff, green, threshold, width, False).delta
-    delta = rest + in_series(found.delta - rest, low - rest, high - rest)
+    low = solve_lifted(stiff, green, threshold, width, plain).delta
+    delta = in_series(difference(found.delta, rest), difference(low, rest), difference(high, rest))
     doubt = 0.0
-    for i in range(green.electrodes):
-        doubt = max(doubt, SERIES * abs(delta[i, i] - found.delta[i, i]))
-    found.delta[:] = delta
+    for i in range(m):
+        before = found.delta[i, i]
+        for j in range(m):
+            found.delta[i, j] = delta[i, j] + rest[i, j]
+        if i < green.electrodes:
+            doubt = max(doubt, SERIES * abs(found.delta[i, i] - before))
     return Solution(
         found.delta,
         found.residual_correction,
@@ -217,7 +221,7 @@ def solve_lifted(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
 ) -> Solution:
     """As :func:`solve`; of near dielectrics, nothing of what the lift removes is added."""
-    near, facing = near_bodies(bodies, green), facing_of(bodies)
+    near, facing = near_bodies(bodies, green, np.bool_(False)), facing_of(bodies)
     placed_as, scored, lifted = bodies, bodies, near.copy()
     if near.any() or facing.pairs > 0:
         bodies = bodies.copy()  # what follows changes them
@@ -281,9 +285,9 @@ def slopes_of(
         for r in range(6):
             delta = step if r < 3 else step / arm
             move(moved[b], bodies[b], r, delta)
-            after = solve(moved, green, threshold, width, False).delta
+            after = solve(moved, green, threshold, width, np.bool_(False)).delta
             move(moved[b], bodies[b], r, -delta)
-            before = solve(moved, green, threshold, width, False).delta
+            before = solve(moved, green, threshold, width, np.bool_(False)).delta
             for i in range(m):
                 for j in range(m):
                     out[b, i, j, r] = (after[i, j] - before[i, j]) / (2.0 * delta)
@@ -311,7 +315,7 @@ def solve_each(
     for scene in range(k):
         if first[scene] < first[scene + 1]:
             part = bodies[first[scene] : first[scene + 1]]
-            found = solve(part, green, threshold, width, False)
+            found = solve(part, green, threshold, width, np.bool_(False))
             size[scene], error[scene] = found.size, found.error
             for i in range(m):
                 for j in range(m):

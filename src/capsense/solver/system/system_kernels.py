@@ -37,10 +37,10 @@ from capsense.solver.selection.selection_kernels import is_there
 SHEET = 6.0
 """Impedance of a thin sheet to charge that moves from one part of a cluster to the other, times its
 thickness. It is the same for clusters of any size: with wave number k along a sheet it is 2 / (k t)
-times the energy in free space, which goes with k. The figure makes square sheets of eps 3 to 80 and
+times the energy in free space, which goes with k. The value makes square sheets of eps 3 to 80 and
 1 to 3 mm read within 30 % of boxes of that thickness, mostly within 15 %."""
 GAIN = 1.3
-"""What the functions directly below the cut stand for: themselves, and all below them."""
+"""Weight of the functions directly below the cut, which represent all below them too."""
 COARSE = 0.6
 """What panels are too coarse for, by estimate, over the energy of the functions that end in them.
 ``benchmarks/limits.py`` sets the estimate beside the errors of wide boxes near a sensor."""
@@ -73,7 +73,7 @@ class Reduced(NamedTuple):
     delta: NDArray[Any]
     """ΔC [m], shape (m, m)."""
     left: NDArray[Any]
-    """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    """The part of it due to functions outside the system [m], shape (m, m)."""
     coarse: NDArray[Any]
     """Estimate of what panels are too coarse for, of the diagonal [m], shape (m,)."""
     charge: NDArray[Any]
@@ -90,8 +90,9 @@ def _differences(cut, functions, values, out, start):
     """
     width, zero = values.shape[1], wide_splat(np.float32(0.0))
     for f in range(out.shape[0]):
-        a, o = functions.cluster[f], f * out.shape[1] + start
-        x, y = (cut.children[a, 0], cut.children[a, 1]) if a >= 0 else (-1 - a, np.int64(-1))
+        x, y, o = functions.cluster[f], np.int64(-1), f * out.shape[1] + start
+        if not functions.net[f]:
+            x, y = cut.children[x, 0], cut.children[x, 1]
         for i in range(0, width, WIDE):
             less = wide_span(values, y * width + i) if y >= 0 else zero
             put_span(out, o + i, vsub(wide_span(values, x * width + i), less))
@@ -224,9 +225,9 @@ def _add_matter(bodies, functions, matrix, own):
     solved = functions.solved
     for f in range(functions.cluster.shape[0]):
         body = bodies[functions.body[f]]
-        if functions.cluster[f] < 0:
+        if functions.net[f]:
             for e in range(f + 1):
-                if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
+                if functions.net[e] and bodies[functions.body[e]].group == body.group:
                     matrix[f, e] += body.ground_elastance
         elif body.sheet > 0.0:
             along = SHEET * body.inverse_susceptibility / body.sheet
@@ -352,8 +353,8 @@ def leaf_charges(cut, functions, x, leaves):
     for f in range(functions.cluster.shape[0]):
         a = functions.cluster[f]
         for i in range(m):
-            if a < 0:
-                charge[-1 - a, i] += x[f, i]
+            if functions.net[f]:
+                charge[a, i] += x[f, i]
             else:
                 charge[cut.children[a, 0], i] += x[f, i]
                 charge[cut.children[a, 1], i] -= x[f, i]

@@ -54,7 +54,7 @@ how much of that of dielectrics, of whose inside few panels tell."""
 _SLENDER = 4.0
 """Lengths beyond so many widths do not make panels too wide."""
 _PIECE = 4e-3
-"""Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""
+"""Edges of the pieces of wide bodies [m]: what can be resolved at gaps of some millimetres."""
 _FEWEST, _DOUBLINGS = 5000, 3
 """Pieces of wide bodies are so many, doubled at most so often."""
 _COARSE, _THICK = 1000, 2.0
@@ -68,7 +68,7 @@ _FOIL = 5e-5
 FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 """Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
 of its faces: the first of those with flat sides, of which four points do not tell the faces apart
-there; the second of others, whose limbs are told apart first. Those with flat sides are thicker
+there; the second of others, whose limbs are separated first. Those with flat sides are thicker
 than the third of their least extent."""
 _CLUSTERS = 1000
 """Clusters from which the charges of wide bodies are found, and the energies of larger ones."""

@@ -143,7 +143,7 @@ class RigidShape(Frozen):
 
     @cached_property
     def record(self) -> np.void:
-        """What the kernels take of a body that its shape tells; points to arrays held here."""
+        """The fields of a body's record that follow from its shape; points to arrays held here."""
         record = np.zeros(1, BODY)[0]
         record["n"] = record["n_tabulated"] = len(self.panels)
         record["n_panel_clusters"] = 2 * len(self.panels) - 1

@@ -169,7 +169,7 @@ def rigid(shape: Shape, count: int, *, conducting: bool = False) -> tuple[RigidS
         shape: A primitive or a mesh.
         count: About how many panels cover a primitive; meshes get more.
         conducting: Whether it holds no field inside. On a thin conductor, charge on one face does
-            nearly what it does on the other: faces are told apart in small clusters only, as the
+            nearly what it does on the other: faces are separated in small clusters only, as the
             estimate of the step takes functions for independent.
 
     Raises:
@@ -241,7 +241,7 @@ def _kept(
 
 
 def _form(shape: Shape, count: int) -> tuple[float, tuple[Hashable, ...], Shape]:
-    """A shape's size [m], what tells its form from others, and its form, of size 1."""
+    """A shape's size [m], what identifies its form, and its form, of size 1."""
     if isinstance(shape, TriMesh):
         digest = hashlib.sha256(repr((count, shape.vertices.shape)).encode())
         for values in (shape.vertices, shape.faces):

@@ -74,7 +74,7 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
     Args:
         shape: The shape.
         finest: Parts with a side longer than this are halved [m].
-        surface: What its panels stand for.
+        surface: The surface that its panels approximate.
     """
     if _sides(_flat(shape.panels)[0]).max() <= finest:
         return shape

@@ -326,7 +326,7 @@ def prune(children, panel, wanted, new_kids, new_panel, function, room):
         children: Parts of the clusters of the whole tree, -1 for single panels, shape (2 n - 1, 2).
         panel: Panel of a cluster without parts, shape (2 n - 1,).
         wanted: Which panels stay, at least one, shape (n,).
-        new_kids, new_panel, function: Filled with the tree of m panels, as in ``Tree``; room for n.
+        new_kids, new_panel, function: Filled with the tree of m panels, as in ``Tree``; capacity n.
         room: Room to work in, shape (2, 2 n - 1).
 
     Returns:
