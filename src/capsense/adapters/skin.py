@@ -10,9 +10,9 @@ import numpy as np
 
 from capsense._thread_pool import ForkSafeRLock, ThreadPool
 from capsense._validate import suggest
-from capsense.adapters import GeometrySensor
+from capsense.adapters import GeometrySensor, WorldSource
 from capsense.adapters.placement import blind
-from capsense.adapters.world import Frames, World, WorldSource
+from capsense.adapters.world import Frames, World
 from capsense.design.model import Domain
 from capsense.errors import SceneError, listed
 from capsense.reading import Reading

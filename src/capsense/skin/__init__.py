@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from capsense.skin.layout import SkinLayout
+from capsense.skin.layout import Pad, SkinLayout
 from capsense.skin.make import from_mesh, from_taxels, paint
 from capsense.skin.reader import (
     AnyDesign,
@@ -18,6 +18,6 @@ from capsense.skin.reader import (
 )
 
 __all__ = [
-    "AnyDesign", "Skin", "SkinLayout", "from_mesh", "from_taxels", "make_simulators", "paint",
+    "AnyDesign", "Pad", "Skin", "SkinLayout", "from_mesh", "from_taxels", "make_simulators", "paint",
     "read_all", "reset_all", "use_readouts",
 ]  # fmt: skip

@@ -6,11 +6,12 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._validate import as_number
 from capsense.design import parse_design
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
@@ -29,6 +30,31 @@ _SIGHT = 0.40
 """Side of the box in which a patch looks for bodies [m]."""
 _BUILD, _READ = 3.0, 1e-3
 """About how long a field takes to build, and a patch that sees something to read [s]."""
+
+
+@dataclass(frozen=True)
+class Pad:
+    """A disc electrode that is bent with the link.
+
+    Raises:
+        SceneError: A length is not from 10 µm to 1 m, or there is no such housing.
+    """
+
+    size: float = 0.012
+    """Diameter [m]."""
+    depth: float = 0.003
+    """Distance of the electrode from the housing behind it [m]."""
+    housing: Literal["shield", "ground"] = "shield"
+    """Whether the link behind the electrode is driven as a shield or is ground."""
+
+    def __post_init__(self) -> None:
+        for name in ("size", "depth"):
+            if not 1e-5 <= as_number(getattr(self, name)) <= 1.0:
+                raise SceneError(
+                    f"{name} is {getattr(self, name)!r}; give a length in metres, such as 0.012"
+                )
+        if self.housing not in ("shield", "ground"):
+            raise SceneError(f"housing is {self.housing!r}; give 'shield' or 'ground'")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,8 +157,7 @@ class SkinLayout(Mapping[str, tuple[Design, Pose]]):
         return self
 
 
-def pad_design(outline: Mapping[str, Any], size: float, radius: float, depth: float,
-               housing: str) -> Design:  # fmt: skip
+def pad_design(outline: Mapping[str, Any], size: float, radius: float, pad: Pad) -> Design:
     """One electrode on a link, as a film at a distance from the housing.
 
     The housing is a sheet behind the electrode, of 100 mm or, on thin links, nearly all round.
@@ -141,22 +166,21 @@ def pad_design(outline: Mapping[str, Any], size: float, radius: float, depth: fl
         outline: Keys of the electrode's shape, as in a design file.
         size: Its largest extent [m].
         radius: Of the cylinder that it is bent onto [m], infinite where it is flat.
-        depth: Distance from the housing [m].
-        housing: ``"shield"`` or ``"ground"``.
+        pad: How far the housing is, and what it is.
     """
     breadth = size + BACKING
     around = min(breadth, _ROUND_THE_LINK * 2 * math.pi * radius)
     half_angle = 0.5 * around / radius
     sag = radius * (1 - math.cos(min(half_angle, math.pi))) if math.isfinite(radius) else 0.0
     side = max(_SIGHT, 2 * breadth)
-    backplane = round(sag + depth + 0.02, 6)
+    backplane = round(sag + pad.depth + 0.02, 6)
     data: dict[str, Any] = {
         "name": "pad" if math.isinf(radius) else f"pad on a radius of {1e3 * radius:g} mm",
         "domain": {"size": [side, side, side + backplane], "backplane": backplane, "open": True},
         "electrode": [{"name": "E1", **outline}],
         "conductor": [
-            {"name": "housing", "role": housing, "shape": "rectangle",
-             "size": [around, breadth], "z": -depth}
+            {"name": "housing", "role": pad.housing, "shape": "rectangle",
+             "size": [around, breadth], "z": -pad.depth}
         ],
     }  # fmt: skip
     if math.isfinite(radius):

@@ -19,7 +19,7 @@ from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Pose
 from capsense.scene.surface import connected_parts
-from capsense.skin.layout import SkinLayout, pad_design
+from capsense.skin.layout import Pad, SkinLayout, pad_design
 from capsense.skin.surface import (
     Fit,
     LinkMesh,
@@ -37,8 +37,8 @@ from capsense.skin.taxels import Taxels, checked_taxels, read_taxels
 
 Array = NDArray[np.float64]
 Region = tuple[Sequence[float], Sequence[float]] | Callable[[Array, Array], NDArray[np.bool_]]
-Housing = Literal["shield", "ground"]
 
+_PAD, _TAXEL = Pad(), Pad(0.004)
 _CLASS = 1e-4
 """Patches of one design differ in how far they bulge by no more than about this [m]."""
 _CANDIDATES = (40, 4_000, 20_000)
@@ -53,10 +53,7 @@ def from_mesh(
     count: int | None = None,
     spacing: float | None = None,
     region: Region | None = None,
-    size: float = 0.012,
-    depth: float = 0.003,
-    housing: Housing = "shield",
-    design: Design | str | Path | None = None,
+    patch: Pad | Design | str | Path = _PAD,
     unit: str = "m",
 ) -> SkinLayout:
     """Spread electrodes evenly over the outer surface of a link.
@@ -71,10 +68,8 @@ def from_mesh(
         spacing: Least straight distance between their middles [m]; by default ``size``.
         region: Where patches may be: lower and upper corner of a box [m] in the frame of the link,
             or a function of points (n, 3) and normals (n, 3) that returns booleans (n,).
-        size: Diameter of an electrode [m].
-        depth: Distance of the electrodes from the housing [m].
-        housing: Whether the link is driven as a ``"shield"`` or is ``"ground"``.
-        design: A design for all patches, in place of discs.
+        patch: The electrode of each patch; or one design for all of them: a ``Design``, a packaged
+            name or a file.
         unit: Of the mesh: ``"m"``, ``"mm"``, ``"cm"`` or ``"in"``.
 
     Raises:
@@ -82,14 +77,12 @@ def from_mesh(
         DesignError: The design is wrong.
     """
     wanted = _checked_count(count, spacing)
-    size, depth, housing = _checked_pad(size, depth, housing)
-    given = _given(design)
-    width = size if given is None else _extent(given)
+    chosen_patch, width = _checked_patch(patch)
     apart = width if spacing is None else _positive("spacing", spacing)
     if apart < width:
         raise SceneError(
             f"spacing is {1e3 * apart:g} mm, less than the {1e3 * width:g} mm of a patch, so they "
-            "would overlap; increase spacing or decrease size"
+            "would overlap; increase spacing or make the patch smaller"
         )
     mesh = read_link(link, unit)
     samples = sample(mesh, width)
@@ -108,12 +101,12 @@ def from_mesh(
         raise SceneError(
             f"{len(at)} patches of {1e3 * width:g} mm fit {1e3 * apart:g} mm apart on the smooth "
             f"outer surface{'' if region is None else ' in the region'}, not {wanted or 'one'}; "
-            "decrease count, size or spacing, or extend region"
+            "decrease count, spacing or the patch's size, or extend region"
         )
     chosen = Samples(places.points[at], places.normals[at])
     frames = fit(chosen, samples, tree, 0.5 * width, principal_axes(mesh))
     names = [f"patch_{k:0{len(str(len(at) - 1))}d}" for k in range(len(at))]
-    designs = _pads(frames, size, depth, housing) if given is None else [given] * len(at)
+    designs = _designs(frames, chosen_patch)
     return _layout(names, chosen.points, frames, designs, samples, tree, {}).warn()
 
 
@@ -123,10 +116,7 @@ def from_taxels(
     *,
     link: object | None = None,
     pose: Pose | None = None,
-    size: float = 0.004,
-    depth: float = 0.003,
-    housing: Housing = "shield",
-    design: Design | str | Path | None = None,
+    patch: Pad | Design | str | Path = _TAXEL,
     unit: str = "m",
 ) -> SkinLayout:
     """Put an electrode at the place of each taxel of a list.
@@ -142,25 +132,20 @@ def from_taxels(
         link: Mesh of the link in its frame [m], from which electrodes take how they are bent; by
             default they are flat.
         pose: Frame of the taxels in the frame of the link.
-        size: Diameter of an electrode [m].
-        depth: Distance of the electrodes from the housing [m].
-        housing: Whether the link is driven as a ``"shield"`` or is ``"ground"``.
-        design: A design for all taxels, in place of discs.
+        patch: The electrode of each taxel, by default of 4 mm; or one design for all of them.
         unit: Of the positions: ``"m"``, ``"mm"``, ``"cm"`` or ``"in"``.
 
     Raises:
         SceneError: The file, an array or an option is wrong.
         DesignError: The design is wrong.
     """
-    size, depth, housing = _checked_pad(size, depth, housing)
-    given = _given(design)
+    chosen_patch, width = _checked_patch(patch)
     if isinstance(taxels, str | Path):
         found = read_taxels(Path(taxels), unit)
     else:
         found = _from_arrays(taxels, normals, unit)
     at = Pose() if pose is None else pose
     points = Samples(at.apply(found.positions), found.normals @ at.rotation.T)
-    width = size if given is None else _extent(given)
     if link is None:
         axes = np.eye(3)
         tree, samples = KDTree(points.points), Samples(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -171,7 +156,7 @@ def from_taxels(
         samples = sample(mesh, width)
         tree = KDTree(samples.points)
         frames = fit(points, samples, tree, 0.5 * width, principal_axes(mesh))
-    designs = [given] * len(found.names) if given else _pads(frames, size, depth, housing)
+    designs = _designs(frames, chosen_patch)
     return _layout(
         found.names, points.points, frames, designs, samples, tree, found.left_out
     ).warn()
@@ -182,7 +167,7 @@ def paint(
     mask: ArrayLike | None = None,
     *,
     depth: float = 0.003,
-    housing: Housing = "shield",
+    housing: Literal["shield", "ground"] = "shield",
     unit: str = "m",
 ) -> SkinLayout:
     """Make an electrode of each connected region of a label that is painted on a link.
@@ -204,7 +189,7 @@ def paint(
         SceneError: The mesh or the mask is wrong, nothing is painted, or a region does not unroll.
         DesignError: A region is no electrode, such as one that is too thin.
     """
-    _, depth, housing = _checked_pad(0.01, depth, housing)
+    pad = Pad(depth=depth, housing=housing)
     mesh = read_link(link, unit)
     labels = _face_labels(mesh, _file_colours(link) if mask is None else np.asarray(mask))
     _, welded = np.unique(np.rint(mesh.vertices / 1e-8), axis=0, return_inverse=True)
@@ -218,14 +203,12 @@ def paint(
         for k in range(int(part.max()) + 1):
             name = f"region_{label}" + (f"_{k}" if part.max() else "")
             one = LinkMesh(mesh.vertices, mesh.faces[painted[part == k]])
-            design, pose, off = _region(name, one, axes, depth, housing)
+            design, pose, off = _region(name, one, axes, pad)
             patches[name], deviation[name] = (design, pose), off
     return SkinLayout(patches, deviation).warn()
 
 
-def _region(
-    name: str, mesh: LinkMesh, axes: Array, depth: float, housing: str
-) -> tuple[Design, Pose, float]:
+def _region(name: str, mesh: LinkMesh, axes: Array, pad: Pad) -> tuple[Design, Pose, float]:
     """The design of a painted region, where it is, and how far it leaves the surface [m]."""
     corners = mesh.vertices[mesh.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -251,7 +234,7 @@ def _region(
         guess = frames.curvature[0, 0]
         found = minimize_scalar(roughness, bounds=(0.5 * guess, 2 * guess), method="bounded")
         radius = float(f"{1 / found.x:.3g}")
-        radius = max(radius, 2 * depth)
+        radius = max(radius, 2 * pad.depth)
     height = float(np.mean(_unrolled(inner, radius)[:, 2]))
     local[..., 2] -= height
     flat = _unrolled(local, radius)
@@ -266,9 +249,9 @@ def _region(
     if outline.interiors:
         shape["holes"] = [_ring(r) for r in outline.interiors]
     size = float(np.ptp(flat[..., :2].reshape(-1, 2), axis=0).max())
-    pad = pad_design(shape, size, radius, depth, housing)
+    design = pad_design(shape, size, radius, pad)
     pose = Pose.from_matrix(_matrix(rotation, middle.points[0] + height * rotation[:, 2]))
-    return pad, pose, float(np.abs(flat[..., 2]).max())
+    return design, pose, float(np.abs(flat[..., 2]).max())
 
 
 def _ring(ring: Any) -> list[list[float]]:
@@ -302,10 +285,13 @@ def _layout(
     return SkinLayout(patches, deviation, dict(left_out))
 
 
-def _pads(frames: Fit, size: float, depth: float, housing: str) -> list[Design]:
-    """The design of each disc; discs that bulge nearly alike have one."""
+def _designs(frames: Fit, patch: Pad | Design) -> list[Design]:
+    """The design of each patch; discs that bulge nearly alike have one."""
+    if isinstance(patch, Design):
+        return [patch] * len(frames.rotation)
+    size = patch.size
     step = 16 * _CLASS / size**2
-    strongest = 1 / max(2 * depth, 0.5 * size)
+    strongest = 1 / max(2 * patch.depth, 0.5 * size)
     curvature = np.clip(frames.curvature[:, 0], 0.0, strongest)
     number = np.rint(curvature / step).astype(int)
     made: dict[float, Design] = {}
@@ -314,7 +300,7 @@ def _pads(frames: Fit, size: float, depth: float, housing: str) -> list[Design]:
         radius_of[k] = float(f"{1 / curvature[number == k].mean():.2g}")
     for radius in set(radius_of[k] for k in number.tolist()):
         outline = {"shape": "disc", "radius": size / 2}
-        made[radius] = pad_design(outline, size, radius, depth, housing)
+        made[radius] = pad_design(outline, size, radius, patch)
     return [made[radius_of[k]] for k in number.tolist()]
 
 
@@ -402,10 +388,12 @@ def _from_arrays(positions: ArrayLike, normals: ArrayLike | None, unit: str) -> 
     return checked_taxels(rows, UNITS[unit], "taxels")
 
 
-def _given(design: Design | str | Path | None) -> Design | None:
-    if design is None or isinstance(design, Design):
-        return design
-    return load_design(design)
+def _checked_patch(patch: Pad | Design | str | Path) -> tuple[Pad | Design, float]:
+    """A pad or a design, and its size [m]."""
+    if isinstance(patch, Pad):
+        return patch, patch.size
+    design = patch if isinstance(patch, Design) else load_design(patch)
+    return design, _extent(design)
 
 
 def _extent(design: Design) -> float:
@@ -426,12 +414,6 @@ def _checked_count(count: object, spacing: object) -> int | None:
     if not (number.is_integer() and 1 <= number <= 10_000):
         raise SceneError(f"count is {count!r}; give a whole number from 1 to 10000")
     return int(number)
-
-
-def _checked_pad(size: object, depth: object, housing: Any) -> tuple[float, float, Housing]:
-    if housing not in ("shield", "ground"):
-        raise SceneError(f"housing is {housing!r}; give 'shield' or 'ground'")
-    return _positive("size", size), _positive("depth", depth), housing
 
 
 def _positive(name: str, value: object) -> float:
