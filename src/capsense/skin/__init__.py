@@ -18,6 +18,6 @@ from capsense.skin.reader import (
 )
 
 __all__ = [
-    "AnyDesign", "Pad", "Skin", "SkinLayout", "from_mesh", "from_taxels", "make_simulators", "paint",
-    "read_all", "reset_all", "use_readouts",
+    "AnyDesign", "Pad", "Skin", "SkinLayout", "from_mesh", "from_taxels", "make_simulators",
+    "paint", "read_all", "reset_all", "use_readouts",
 ]  # fmt: skip

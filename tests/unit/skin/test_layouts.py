@@ -209,7 +209,9 @@ def test_painted_faces_become_electrodes() -> None:
 
 def test_painted_regions_of_a_round_link_unroll() -> None:
     """Two separate regions of one label; each is bent onto the link's radius."""
-    mesh = trimesh.creation.cylinder(RADIUS, 0.25, sections=96).subdivide().subdivide()
+    heights = np.linspace(-0.125, 0.125, 51)
+    outline = [(0.0, -0.125), *[(RADIUS, z) for z in heights], (0.0, 0.125)]
+    mesh = trimesh.creation.revolve(outline, sections=96)
     x, y, z = mesh.triangles_center.T
     side = np.hypot(x, y) > 0.9 * RADIUS
     mask = side & (np.abs(np.arctan2(y, x)) < 0.4) & (np.abs(np.abs(z) - 0.06) < 0.03)
