@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 LARGE_DEVIATION = 5e-4
 """A design that leaves the surface of the link by more than this [m] brings a warning."""
 BACKING = 0.10
-"""Side of the sheet behind an electrode that stands for the link [m]."""
-_ROUND_THE_LINK = 0.95
-"""The sheet goes round no more than this part of a round link."""
+"""The housing behind an electrode is longer than that by this [m]."""
+FLATTEST = 0.15
+"""Electrodes on larger radii [m] are flat."""
 _SIGHT = 0.40
 """Side of the box in which a patch looks for bodies [m]."""
 _BUILD, _READ = 3.0, 1e-3
@@ -160,7 +160,7 @@ class SkinLayout(Mapping[str, tuple[Design, Pose]]):
 def pad_design(outline: Mapping[str, Any], size: float, radius: float, pad: Pad) -> Design:
     """One electrode on a link, as a film at a distance from the housing.
 
-    The housing is a sheet behind the electrode, of 100 mm or, on thin links, nearly all round.
+    The housing reaches 50 mm beyond the electrode: a sheet, or a cylinder where it is bent.
 
     Args:
         outline: Keys of the electrode's shape, as in a design file.
@@ -169,20 +169,23 @@ def pad_design(outline: Mapping[str, Any], size: float, radius: float, pad: Pad)
         pad: How far the housing is, and what it is.
     """
     breadth = size + BACKING
-    around = min(breadth, _ROUND_THE_LINK * 2 * math.pi * radius)
-    half_angle = 0.5 * around / radius
-    sag = radius * (1 - math.cos(min(half_angle, math.pi))) if math.isfinite(radius) else 0.0
     side = max(_SIGHT, 2 * breadth)
-    backplane = round(sag + pad.depth + 0.02, 6)
+    round_link = math.isfinite(radius)
+    backplane = round((2 * radius if round_link else pad.depth) + 0.02, 6)
+    conductor: dict[str, Any] = {"name": "housing", "role": pad.housing}
+    if round_link:
+        conductor |= {
+            "shape": "cylinder", "radius": radius - pad.depth, "length": breadth,
+            "center": [0.0, 0.0, -radius], "tilt": [90, 0, 0],
+        }  # fmt: skip
+    else:
+        conductor |= {"shape": "rectangle", "size": [breadth, breadth], "z": -pad.depth}
     data: dict[str, Any] = {
-        "name": "pad" if math.isinf(radius) else f"pad on a radius of {1e3 * radius:g} mm",
+        "name": f"pad on a radius of {1e3 * radius:g} mm" if round_link else "pad",
         "domain": {"size": [side, side, side + backplane], "backplane": backplane, "open": True},
         "electrode": [{"name": "E1", **outline}],
-        "conductor": [
-            {"name": "housing", "role": pad.housing, "shape": "rectangle",
-             "size": [around, breadth], "z": -pad.depth}
-        ],
-    }  # fmt: skip
-    if math.isfinite(radius):
+        "conductor": [conductor],
+    }
+    if round_link:
         data["bend"] = {"radius": radius}
     return parse_design(data, source="skin")

@@ -19,7 +19,7 @@ from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Pose
 from capsense.scene.surface import connected_parts
-from capsense.skin.layout import Pad, SkinLayout, pad_design
+from capsense.skin.layout import FLATTEST, Pad, SkinLayout, pad_design
 from capsense.skin.surface import (
     Fit,
     LinkMesh,
@@ -226,7 +226,7 @@ def _region(name: str, mesh: LinkMesh, axes: Array, pad: Pad) -> tuple[Design, P
     local = (corners - middle.points[0]) @ rotation
     inner = (samples.points - middle.points[0]) @ rotation
     radius = math.inf
-    if frames.curvature[0, 0] * reach > 0.02:
+    if frames.curvature[0, 0] * reach > 0.02 and frames.curvature[0, 0] > 1 / FLATTEST:
 
         def roughness(curvature: float) -> float:
             return float(np.var(_unrolled(inner, 1 / curvature)[:, 2]))
@@ -293,6 +293,7 @@ def _designs(frames: Fit, patch: Pad | Design) -> list[Design]:
     step = 16 * _CLASS / size**2
     strongest = 1 / max(2 * patch.depth, 0.5 * size)
     curvature = np.clip(frames.curvature[:, 0], 0.0, strongest)
+    curvature[curvature < 1 / FLATTEST] = 0.0
     number = np.rint(curvature / step).astype(int)
     made: dict[float, Design] = {}
     radius_of = {0: math.inf}

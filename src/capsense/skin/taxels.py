@@ -106,7 +106,7 @@ def _csv_rows(path: Path, lines: list[str]) -> list[tuple[str, str, list[float]]
             f"{path}, line 1: there is no column {missing[0]!r}; the header must name "
             f"{', '.join(_COLUMNS)}, and may name 'name'"
         )
-    out = []
+    out: list[tuple[str, str, list[float]]] = []
     for cells in table:
         place = f"{path}, line {table.line_num}"
         if not any(cell.strip() for cell in cells):
