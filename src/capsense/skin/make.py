@@ -362,7 +362,8 @@ def _within(places: Samples, region: Region | None) -> Samples:
         raise SceneError(
             f"region is {region!r}; give the lower and the upper corner of a box, or a function"
         ) from None
-    return _chosen(places, ((places.points >= low) & (places.points <= high)).all(axis=1))
+    inside = (places.points >= low) & (places.points <= high)
+    return _chosen(places, np.asarray(inside.all(axis=1)))
 
 
 def _chosen(places: Samples, which: NDArray[np.bool_]) -> Samples:
