@@ -114,8 +114,10 @@ def test_round_links_take_one_bent_design_of_their_radius() -> None:
     assert "30 patches, 30 electrodes" in repr(layout)
 
 
+@pytest.mark.e2e
 def test_a_patch_reads_what_its_design_reads_where_it_is_placed_by_hand() -> None:
-    layout = cs.skin.from_mesh(cylinder(), count=12, region=((-1, -1, -0.1), (1, 1, 0.1)))
+    out = np.array([[math.cos(0.7), math.sin(0.7), 0.0]])
+    layout = cs.skin.from_taxels(RADIUS * out, out, link=cylinder(), patch="arm_segment")
     name, (design, pose) = next(iter(layout.items()))
     x, y, z = pose.position
     long = math.copysign(1.0, pose.rotation[2, 1])
@@ -129,7 +131,8 @@ def test_a_patch_reads_what_its_design_reads_where_it_is_placed_by_hand() -> Non
     scene = cs.Scene([ball.moved(link @ ball.pose)])
     read = skin.step(scene, {name: layout.poses(link)[name], "hand": link @ hand})
     assert read["hand"].delta[0, 0] > 1e-16
-    assert read[name].delta[0, 0] == approx(read["hand"].delta[0, 0], rel=0.01)
+    gains = np.diag(read["hand"].delta)
+    np.testing.assert_allclose(np.diag(read[name].delta), gains, atol=0.02 * gains.max())
 
 
 def test_patches_inside_neighbours_are_left_out() -> None:
