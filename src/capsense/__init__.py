@@ -23,7 +23,7 @@ _HOMES = {
     for name in node.names
 }
 """The module of each public name."""
-_MODULES = ("humans", "assistive_gym", "coppeliasim", "mujoco", "pybullet")
+_MODULES = ("humans", "skin", "assistive_gym", "coppeliasim", "mujoco", "pybullet")
 __all__ = ["__version__", *_HOMES]
 
 

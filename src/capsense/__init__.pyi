@@ -1,6 +1,6 @@
 """The public names, and where they are from; see ``docs/conventions.md``."""
 
-from capsense import humans
+from capsense import humans, skin
 from capsense.adapters import AttachedSensor, assistive_gym, coppeliasim, mujoco, pybullet
 from capsense.design import available_designs, load_design
 from capsense.design.model import Design
@@ -60,5 +60,5 @@ __all__ = [
     "StepStats", "TriMesh", "__version__", "assistive_gym", "available_chips", "available_designs",
     "calibrate", "coppeliasim", "decode_permittivity", "encode_permittivity", "humans",
     "load_design", "load_readout", "load_scenario", "mujoco", "open_recording", "plot",
-    "point_surface", "pybullet", "record", "render_depth", "replay", "show",
+    "point_surface", "pybullet", "record", "render_depth", "replay", "show", "skin",
 ]  # fmt: skip

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from capsense.adapters import GeometrySensor, make_simulator, refuse_missing
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
-from capsense.adapters.rules import AttachOptions, Image, check_perception, split_rules
-from capsense.adapters.skin import AttachedSkin, simulators_of
+from capsense.adapters.rules import AttachOptions, Image, Rules, check_perception, split_rules
+from capsense.adapters.skin import AttachedSkin, clear_of_neighbours, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed, require_package
@@ -22,7 +22,7 @@ from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.scene.pose import checked_pose
 from capsense.simulator import DEFAULT_DESIGN, Simulator
-from capsense.skin import AnyDesign
+from capsense.skin import AnyDesign, SkinLayout
 
 if TYPE_CHECKING:
     import mujoco
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 __all__ = [
-    "AttachedSkin", "MujocoDepthSensor", "MujocoOptions", "MujocoSensor", "add_sensor", "attach",
-    "attach_skin",
+    "AttachedSkin", "MujocoDepthSensor", "MujocoOptions", "MujocoSensor", "add_sensor", "add_skin",
+    "attach", "attach_skin",
 ]  # fmt: skip
 
 _AWAY = 5.0
@@ -357,17 +357,10 @@ def add_sensor(
     """
     import mujoco
 
-    if not isinstance(spec, mujoco.MjSpec):
-        raise TypeError(
-            f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, such as "
-            "mujoco.MjSpec.from_file(path)"
-        )
+    carrier = _find_body(spec, body)
     checked_pose(pose)
     if not isinstance(name, str) or not name:
         raise SceneError(f"name is {name!r}; give the new site a name, like 'pad'")
-    carrier = spec.body(body) if isinstance(body, str) else None
-    if carrier is None:
-        raise refuse_missing("body", str(body), [b.name for b in spec.bodies if b.name])
     away = math.hypot(*pose.position)
     if away > _AWAY and body != "world":
         raise SceneError(
@@ -392,6 +385,57 @@ def add_sensor(
         objname=name, intprm=[depth, 0, 0],
     )  # fmt: skip
     return name
+
+
+def add_skin(spec: mujoco.MjSpec, body: str, layout: SkinLayout) -> SkinLayout:
+    """Add a site for each patch of a layout to a body of a model.
+
+    Patches that lie inside the geoms of other bodies, in the model's initial state, are left out;
+    a warning names them. After ``spec.compile()``, :func:`attach_skin` takes the sites and the
+    designs of what is returned: ``attach_skin(model, data, sites=list(layout),
+    design=layout.designs)``.
+
+    Args:
+        spec: A model before ``spec.compile()``.
+        body: Name of the body that carries the skin; the layout is in its frame.
+        layout: What ``cs.skin.from_mesh``, ``from_taxels`` or ``paint`` returns.
+
+    Returns:
+        The layout of the patches that were added.
+
+    Raises:
+        MissingDependencyError: MuJoCo is not installed.
+        TypeError: ``spec`` is not an ``MjSpec``, or ``layout`` is no layout.
+        SceneError: There is no such body, a site has the name of a patch, a geom is not supported,
+            or all patches lie inside other bodies.
+    """
+    require_package("mujoco", "MuJoCo", "mujoco")
+    import mujoco
+
+    carrier = _find_body(spec, body)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    source = ModelSource(model, data, Rules(), None)
+    clear = clear_of_neighbours(layout, source, int(carrier.id), Pose())
+    for name, (_, pose) in clear.items():
+        add_sensor(spec, body, pose, name)
+    return clear
+
+
+def _find_body(spec: mujoco.MjSpec, body: str) -> Any:
+    """A body of a model before it is compiled."""
+    import mujoco
+
+    if not isinstance(spec, mujoco.MjSpec):
+        raise TypeError(
+            f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, such as "
+            "mujoco.MjSpec.from_file(path)"
+        )
+    carrier = spec.body(body) if isinstance(body, str) else None
+    if carrier is None:
+        raise refuse_missing("body", str(body), [b.name for b in spec.bodies if b.name])
+    return carrier
 
 
 def _scalar_first(pose: Pose) -> list[float]:

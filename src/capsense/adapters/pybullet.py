@@ -29,7 +29,7 @@ from capsense.adapters.rules import (
     check_perception,
     split_rules,
 )
-from capsense.adapters.skin import AttachedSkin, simulators_of
+from capsense.adapters.skin import AttachedSkin, clear_of_neighbours, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, require_package
@@ -39,14 +39,14 @@ from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
 from capsense.scene.pose import checked_pose
 from capsense.simulator import DEFAULT_DESIGN, Simulator
-from capsense.skin import AnyDesign
+from capsense.skin import AnyDesign, SkinLayout
 
 Array = NDArray[np.float64]
 Shapes = Literal["collision", "visual"]
 
 __all__ = [
     "AttachedSkin", "PybulletDepthSensor", "PybulletOptions", "PybulletSensor", "attach",
-    "attach_skin",
+    "attach_layout", "attach_skin",
 ]  # fmt: skip
 
 _NO_POSE = Pose()
@@ -202,6 +202,52 @@ def attach_skin(
     skin = AttachedSkin(sensors, readout, threads)
     skin.warn()
     return skin
+
+
+def attach_layout(
+    client: Any,
+    body: int,
+    link: int | str,
+    layout: SkinLayout,
+    *,
+    readout: Readout | str | Path | None = None,
+    threads: int | None = None,
+    **options: Unpack[PybulletSkinOptions],
+) -> AttachedSkin:
+    """Attach the patches of a layout to a link; one ``read()`` reads them all.
+
+    Patches that lie inside other links or bodies at present are left out; a warning names them.
+
+    Args:
+        client: What ``pybullet.connect`` returned, or a ``BulletClient``.
+        body: The body that carries the skin.
+        link: The link, by index or name; the layout is in its frame.
+        layout: What ``cs.skin.from_mesh``, ``from_taxels`` or ``paint`` returns.
+        readout: As of :func:`attach_skin`.
+        threads: As of :func:`attach_skin`.
+        options: As of :func:`attach_skin`.
+
+    Raises:
+        MissingDependencyError: PyBullet is not installed.
+        TypeError: There is no such option, or ``layout`` is no layout.
+        ValueError: There are no such shapes, or ``threads`` is not a positive whole number.
+        SceneError: There is no such client, body or link, a pattern fits nothing, a shape is not
+            supported, or all patches lie inside other links.
+        ReadoutError: There is no such chip.
+    """
+    require_package("pybullet", "PyBullet", "pybullet")
+    import pybullet as p
+
+    rules, other = split_rules(options, PybulletSkinOptions)
+    number = _client_number(client)
+    source = ClientSource(number, rules, _checked_shapes(other.get("shapes", "collision")))
+    at = _find_link(number, body, link)
+    inertial = p.getDynamicsInfo(body, at, physicsClientId=number)[3:5]
+    clear = clear_of_neighbours(layout, source, source.index(body, at), Pose(*inertial).inverse())
+    mounts = {name: (at, pose) for name, (_, pose) in clear.items()}
+    return attach_skin(
+        client, body, mounts, clear.designs, readout=readout, threads=threads, **options
+    )
 
 
 class PybulletSensor(GeometrySensor):

@@ -6,16 +6,27 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from capsense._thread_pool import ForkSafeRLock, ThreadPool
 from capsense._validate import suggest
-from capsense.adapters import GeometrySensor
+from capsense.adapters import GeometrySensor, WorldSource
 from capsense.adapters.placement import blind
+from capsense.adapters.world import Frames, World
+from capsense.design.model import Domain
 from capsense.errors import SceneError, listed
 from capsense.reading import Reading
 from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.simulator import Simulator
-from capsense.skin import AnyDesign, make_simulators, read_all, reset_all, use_readouts
+from capsense.skin import (
+    AnyDesign,
+    SkinLayout,
+    make_simulators,
+    read_all,
+    reset_all,
+    use_readouts,
+)
 
 
 class AttachedSkin:
@@ -183,3 +194,38 @@ def simulators_of(
         if name not in design:
             raise SceneError(f"design: nothing is given for {name!r}; give a design for each")
     return make_simulators({name: design[name] for name in names})
+
+
+def clear_of_neighbours(
+    layout: SkinLayout, source: WorldSource, frame: int, link_in_frame: Pose
+) -> SkinLayout:
+    """The patches of a layout that lie inside no other link; a warning names the others.
+
+    Args:
+        layout: Patches on a link.
+        source: The world in the state in which links are compared.
+        frame: The frame that carries the link.
+        link_in_frame: Pose of the link in that frame.
+
+    Raises:
+        TypeError: ``layout`` is no layout.
+        SceneError: All patches lie inside other links.
+    """
+    if not isinstance(layout, SkinLayout):
+        raise TypeError(
+            f"layout is a {type(layout).__name__}; give what cs.skin.from_mesh, from_taxels or "
+            "paint returns"
+        )
+    position, quaternion = source.links()
+    link = Pose(position[frame], quaternion[frame]) @ link_in_frame
+    frames = Frames(position, quaternion, np.array(link.position), np.array(link.quaternion))
+    everywhere = Domain((20.0, 20.0, 20.0), 10.0)
+    clear = layout.clear_of(World(source.solids(frame), everywhere).scene(frames))
+    gone = [name for name in layout if name not in clear]
+    if gone:
+        warnings.warn(
+            f"{len(gone)} of {len(layout)} patches are left out, since they lie inside other "
+            f"links: {listed([f'{name}: {clear.left_out[name]}' for name in gone], 3)}",
+            stacklevel=3,
+        )
+    return clear
