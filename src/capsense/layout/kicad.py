@@ -430,7 +430,7 @@ def _stack(
         return heights, slabs, mask, []
     whole = number(child(board, "general"), "thickness", thickness)
     count = max(len(copper) - 1, 1)
-    heights = {name: -whole * k / count for k, name in enumerate(copper)}
+    heights = {name: -whole * k / count + 0.0 for k, name in enumerate(copper)}
     notes = [f"The file has no stack-up: FR4 of permittivity {FR4}, {whole:g} mm thick, is assumed"
              + (", inner copper at equal distances." if count > 1 else ".")]  # fmt: skip
     return heights, [Slab("board", FR4, (-whole * 1e-3, 0.0))], mask, notes
