@@ -94,14 +94,13 @@ def layout(args: argparse.Namespace) -> int:
     )  # fmt: skip
     if args.output is not None:
         board.save(args.output)
-    if not args.quiet:
-        print(_report(board))
     if args.plot is not None:
         from capsense.plotting.designs import draw_design
 
         drawn = draw_design(board.design).get_figure()
         drawn.savefig(args.plot, dpi=150)  # type: ignore[union-attr]
     if not args.quiet:
+        print(_report(board))
         for what, path in (("design", args.output), ("picture", args.plot)):
             if path is not None:
                 print(f"wrote the {what} to {path}")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -151,7 +152,7 @@ def prism_facets(outline: Polygon, low: float, high: float) -> tuple[Facet, ...]
     ]
     for ring in (outline.exterior, *outline.interiors):
         corners = np.asarray(ring.coords)
-        for start, end in zip(corners[:-1], corners[1:], strict=True):
+        for start, end in pairwise(corners):
             along = (end - start) / (width := float(np.hypot(*(end - start))))
             axes = np.array([[*along, 0.0], [0.0, 0.0, 1.0], [along[1], -along[0], 0.0]])
             facets.append(Facet(box(0.0, 0.0, width, high - low), np.array([*start, low]), axes))

@@ -309,8 +309,8 @@ def _simplified(
 def simplify(shape: BaseGeometry, tolerance: float) -> BaseGeometry:
     """Polygons with fewer corners, each of which is off by at most about ``tolerance`` [m].
 
-    Clefts and holes narrower than twice the tolerance are filled; slivers narrower than a micrometre
-    are dropped.
+    Clefts and holes narrower than twice the tolerance are filled; slivers narrower than a
+    micrometre are dropped.
     """
     closed = shape.buffer(tolerance, join_style="mitre").buffer(-tolerance, join_style="mitre")
     plain = closed.union(shape).simplify(tolerance)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+from zipfile import BadZipFile, ZipFile
 
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
@@ -27,22 +30,30 @@ def read(path: Path, error: float, thickness: float) -> Layout:
         MissingDependencyError: gerbonara is not installed.
     """
     require_package("gerbonara", "gerbonara", "layout")
-    from gerbonara import LayerStack
-
     where = path if path.is_dir() or path.suffix.lower() == ".zip" else path.parent
+    copper: dict[str, list[tuple[BaseGeometry, str]]] = {}
+    drills: list[BaseGeometry] = []
+    edges: list[BaseGeometry] = []
     try:
-        with warnings.catch_warnings():
+        with TemporaryDirectory() as spare, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            stack = LayerStack.open(where)
-            found = [(f"{side} copper" if side in ("top", "bottom") else side, layer)
-                     for (side, _), layer in stack.copper_layers]  # fmt: skip
-            copper = {name: list(_islands(layer, error)) for name, layer in found}
-            drills = [shape for layer in stack.drill_layers for shape, _, _ in _shapes(layer, error)]
-            edges = list(_edges(stack.outline, error)) if stack.outline else []
-    except (OSError, ValueError, SyntaxError, LookupError, AttributeError) as cause:
+            if where.is_file():
+                with ZipFile(where) as archive:
+                    archive.extractall(spare)
+                where = Path(spare)
+            whole, notes = _thickness(where, thickness)
+            files = sorted((role, f) for f in where.rglob("*") if (role := _role(f)) is not None)
+            for (_, role), file in files:
+                layer = _opened(file, role)
+                if role == "drill":
+                    drills += [shape for shape, _, _ in _shapes(layer, error)]
+                elif role == "outline":
+                    edges += _edges(layer, error)
+                else:
+                    copper[role] = list(_islands(layer, error))
+    except (OSError, ValueError, SyntaxError, LookupError, AttributeError, BadZipFile) as cause:
         raise LayoutError(f"{path} is no Gerber set that can be read: {cause}") from None
     outline, _ = outline_of(edges, 0.05)
-    whole, notes = _thickness(where, thickness)
     count = max(len(copper) - 1, 1)
     heights = {name: -whole * k / count + 0.0 for k, name in enumerate(copper)}
     pieces = _joined(copper, drills)
@@ -51,6 +62,38 @@ def read(path: Path, error: float, thickness: float) -> Layout:
         (Slab("board", FR4, (-whole * 1e-3, 0.0)),),
         None if outline is None else in_metres(outline), notes=tuple(notes),
     )  # fmt: skip
+
+
+_ROLES = (
+    (r"FileFunction,Copper,L1,|[-_.]F[._]Cu\.|\.gtl$|copper_top", (0, "F.Cu")),
+    (r"FileFunction,Copper,L\d+,Bot|[-_.]B[._]Cu\.|\.gbl$|copper_bottom", (99, "B.Cu")),
+    (r"FileFunction,Copper,L(\d+),Inr|[-_.]In(\d+)[._]Cu\.|\.g(\d+)$", (1, "In")),
+    (r"FileFunction,Profile|[-_.]Edge[._]Cuts\.|\.gm1$|\.gko$|profile", (100, "outline")),
+    (r"\bM48\b", (101, "drill")),
+)
+"""What a file is by its head and name, and the order of layers from the top down."""
+
+
+def _role(file: Path) -> tuple[int, str] | None:
+    """Place in the order of layers, and what a file is; None of what is not read."""
+    if not file.is_file() or file.suffix.lower() == ".gbrjob":
+        return None
+    head = file.read_bytes()[:4000].decode("latin-1")
+    named = re.search(r"FileFunction,[^*\n]*", head)
+    text = f"{named[0]}" if named and "M48" not in head else f"{head} {file.name}"
+    if not named and "M48" not in head and "%FS" not in head:
+        return None
+    for pattern, (order, role) in _ROLES:
+        if found := re.search(pattern, text, re.IGNORECASE):
+            number = next((g for g in found.groups() if g), "")
+            return order + (int(number) if number else 0), role + (f"{number}.Cu" if number else "")
+    return None
+
+
+def _opened(file: Path, role: str) -> Any:
+    from gerbonara import ExcellonFile, GerberFile
+
+    return (ExcellonFile if role == "drill" else GerberFile).open(file)
 
 
 def _thickness(where: Path, thickness: float) -> tuple[float, list[str]]:
@@ -68,9 +111,9 @@ def _thickness(where: Path, thickness: float) -> tuple[float, list[str]]:
 def _chords(poly: Any, error: float) -> list[tuple[float, float]]:
     """Corners of an outline of lines and arcs."""
     out: list[tuple[float, float]] = []
-    for start, end, (clockwise, center) in poly.segments():
+    for start, end, (clockwise, center) in poly.segments:
         out.append(start)
-        if clockwise is None or center is None:
+        if clockwise is None or center is None or math.dist(start, center) < 1e-9:
             continue
         radius = math.dist(start, center)
         first = math.atan2(start[1] - center[1], start[0] - center[0])
@@ -88,7 +131,8 @@ def _shapes(layer: Any, error: float) -> Iterator[tuple[BaseGeometry, bool, str]
     from gerbonara.utils import MM
 
     for item in layer.objects:
-        attributes = getattr(item, "attrs", None) or {}
+        attributes = getattr(item, "attrs", None)
+        attributes = attributes if isinstance(attributes, dict) else {}
         net = next(iter(attributes.get(".N", ()) or ()), "")
         for primitive in item.to_primitives(unit=MM):
             outline = _chords(primitive.to_arc_poly(), error)

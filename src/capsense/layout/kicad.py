@@ -192,12 +192,12 @@ class _Reader:
             mid = ends["mid"]
         else:
             angle, center = math.radians(number(item, "angle")), np.array(start)
-            arm = np.array(end) - center
+            x, y = np.array(end) - center
             start = end
             mid, end = (
-                (center + [arm[0] * math.cos(a) - arm[1] * math.sin(a),
-                           arm[0] * math.sin(a) + arm[1] * math.cos(a)]).tolist()
-                for a in (angle / 2, angle)
+                [center[0] + x * math.cos(turn) - y * math.sin(turn),
+                 center[1] + x * math.sin(turn) + y * math.cos(turn)]
+                for turn in (angle / 2, angle)
             )  # fmt: skip
         a, b, c = ((p[0], -p[1]) for p in (start, mid, end))
         return arc_through(a, b, c, self.error)

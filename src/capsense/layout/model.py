@@ -116,9 +116,7 @@ def natural(name: str) -> list[tuple[int, str]]:
     """A key that sorts TOUCH2 before TOUCH10."""
     import re
 
-    return [
-        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)
-    ]
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def polygons_of(shape: BaseGeometry) -> list[Polygon]:

@@ -27,7 +27,7 @@ def read(path: Path, error: float, thickness: float) -> Layout:
     from capsense.mesh.gmsh_mesher import import_gmsh
 
     gmsh = import_gmsh()
-    gmsh.initialize(["gmsh", "-noenv"], interruptible=False)
+    gmsh.initialize(interruptible=False)
     try:
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.option.setNumber("Geometry.OCCImportLabels", 1)
@@ -40,7 +40,8 @@ def read(path: Path, error: float, thickness: float) -> Layout:
         pieces: list[tuple[str, float, BaseGeometry]] = []
         outline: list[BaseGeometry] = []
         for number, (dim, tag) in enumerate(bodies, start=1):
-            label = gmsh.model.getEntityName(dim, tag).rpartition("/")[2] or f"body{number}"
+            label = gmsh.model.getEntityName(dim, tag).rpartition("/")[2]
+            label = f"body{number}" if not label or "translator" in label else label
             faces = [tag] if dim == 2 else [
                 abs(t) for _, t in gmsh.model.getBoundary([(dim, tag)], oriented=False)
             ]  # fmt: skip

@@ -32,7 +32,7 @@ def read(path: Path, error: float, thickness: float) -> Layout:
         flat = np.ptp(z, axis=1) < LEVEL
         if not flat.any():
             raise LayoutError(
-                f"{file} has no level face; describe it in a design as shape = \"stl\" instead"
+                f'{file} has no level face; describe it in a design as shape = "stl" instead'
             )
         heights = z[flat].mean(axis=1)
         top = float(heights.max())

@@ -93,3 +93,33 @@ def test_unknown_files(tmp_path: Path) -> None:
     for path in (tmp_path / "a.txt", tmp_path):
         with pytest.raises(cs.LayoutError, match="of no kind that is read"):
             cs.load_layout(path)
+
+
+_HEAD = "%FSLAX46Y46*%\n%MOMM*%\n"
+_FILES = {
+    "b-F_Cu.gbr": _HEAD
+    + "%ADD10R,10X5*%\n%ADD11C,0.5*%\n%ADD12C,1*%\nD10*\nX20000000Y20000000D03*\n"
+    "D11*\nX25000000Y20000000D02*\nX35000000Y20000000D01*\nD12*\nX35000000Y20000000D03*\n"
+    "G36*\nX40000000Y10000000D02*\nX50000000Y10000000D01*\nX50000000Y20000000D01*\n"
+    "X40000000Y20000000D01*\nX40000000Y10000000D01*\nG37*\n%LPC*%\n%ADD13R,2X2*%\nD13*\n"
+    "X45000000Y15000000D03*\nM02*\n",
+    "b-B_Cu.gbr": _HEAD + "%ADD12C,2*%\nD12*\nX35000000Y20000000D03*\nM02*\n",
+    "b-Edge_Cuts.gbr": _HEAD + "%ADD10C,0.1*%\nD10*\nX0Y0D02*\nX60000000Y0D01*\n"
+    "X60000000Y30000000D01*\nX0Y30000000D01*\nX0Y0D01*\nM02*\n",
+    "b.drl": "M48\nMETRIC,TZ\nT1C0.400\n%\nG90\nG05\nT1\nX35.0Y20.0\nT0\nM30\n",
+    "b.gbrjob": '{"GeneralSpecs": {"BoardThickness": 0.8}}',
+}
+
+
+def test_gerber(tmp_path: Path) -> None:
+    """Islands that a drill joins are one net; what is drawn clear is no copper."""
+    pytest.importorskip("gerbonara")
+    for name, text in _FILES.items():
+        (tmp_path / name).write_text(text)
+    layout = cs.load_layout(tmp_path, tolerance=1e-6)
+    areas = found(layout)
+    assert areas["island1"] == (approx(96.0, rel=1e-6), 1)
+    assert areas["island2"][0] == approx(50 + 5 + math.pi / 4 + math.pi, rel=1e-2)
+    assert areas["island2"][1] == 2
+    assert layout.heights == {"F.Cu": 0.0, "B.Cu": -0.8e-3}
+    assert layout.outline.area == approx(1800e-6, rel=1e-6)

@@ -96,7 +96,7 @@ def test_drawn_copper_joins_the_net_that_it_touches(tmp_path: Path) -> None:
     path = board(
         tmp_path,
         pad("rect"),
-        '(gr_poly (pts (xy 50 50) (xy 60 50) (xy 60 60) (xy 50 60)) (width 0) (fill yes) '
+        "(gr_poly (pts (xy 50 50) (xy 60 50) (xy 60 60) (xy 50 60)) (width 0) (fill yes) "
         '(layer "F.Cu"))',
     )
     assert set(areas(path)) == {"T1"}
@@ -146,13 +146,13 @@ def test_bottom_is_mirrored(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("electrodes", "ground", "words"),
     [
-        (["TUCH1"], [], "matches no net of touch_slider.kicad_pcb; did you mean 'TOUCH1'"),
+        (["TUCH1"], [], "matches no net of touch_slider.kicad_pcb; valid are GND, TOUCH1"),
         (["*"], ["GND"], "'GND' of touch_slider.kicad_pcb is both electrode and ground"),
         ([], [], "no electrode is named; the nets are GND, TOUCH1"),
     ],
 )
 def test_wrong_nets(electrodes: list[str], ground: list[str], words: str) -> None:
-    with pytest.raises(cs.LayoutError, match="") as caught:
+    with pytest.raises(cs.LayoutError) as caught:
         cs.load_layout(SLIDER).assign(electrodes, ground=ground)
     assert words in str(caught.value)
 
@@ -167,7 +167,12 @@ def test_nets_that_touch(tmp_path: Path) -> None:
 
 
 def test_damaged_files(tmp_path: Path) -> None:
-    for text in ("(kicad_pcb (version 1)", "(module x)", "", "(kicad_pcb (segment (start 1) (net 1)))"):
+    for text in (
+        "(kicad_pcb (version 1)",
+        "(module x)",
+        "",
+        "(kicad_pcb (segment (start 1) (net 1)))",
+    ):
         path = tmp_path / "bad.kicad_pcb"
         path.write_text(text)
         with pytest.raises(cs.LayoutError, match="bad"):
