@@ -90,7 +90,7 @@ def foam_field(
 
 
 LAYERS = {
-    "unit": "design humans mesh plotting readout scene solver field/test_panels.py "
+    "unit": "design humans unit mesh plotting readout scene solver field/test_panels.py "
     "field/test_grid.py test_constants_page.py test_jit.py test_public_api.py test_reading.py "
     "test_scenario.py test_shared.py test_simd.py test_thread_pool.py",
     "physics": "",  # all that is not named

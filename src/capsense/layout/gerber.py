@@ -51,7 +51,15 @@ def read(path: Path, error: float, thickness: float) -> Layout:
                     edges += _edges(layer, error)
                 else:
                     copper[role] = list(_islands(layer, error))
-    except (OSError, ValueError, SyntaxError, LookupError, AttributeError, BadZipFile) as cause:
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        LookupError,
+        AttributeError,
+        ArithmeticError,
+        BadZipFile,
+    ) as cause:
         raise LayoutError(f"{path} is no Gerber set that can be read: {cause}") from None
     outline, _ = outline_of(edges, 0.05)
     count = max(len(copper) - 1, 1)
@@ -135,10 +143,15 @@ def _shapes(layer: Any, error: float) -> Iterator[tuple[BaseGeometry, bool, str]
         attributes = attributes if isinstance(attributes, dict) else {}
         net = next(iter(attributes.get(".N", ()) or ()), "")
         for primitive in item.to_primitives(unit=MM):
+            dark = bool(getattr(primitive, "polarity_dark", True))
+            if hasattr(primitive, "x1"):  # a stroke with round ends
+                pen = float(primitive.width) / 2
+                stroke = LineString(_line(primitive, error))
+                yield stroke.buffer(pen, quad_segs=quarter_segments(pen, error)), dark, str(net)
+                continue
             outline = _chords(primitive.to_arc_poly(), error)
             if len(outline) > 2:
                 shape = Polygon(outline)
-                dark = bool(getattr(primitive, "polarity_dark", True))
                 yield (shape if shape.is_valid else shape.buffer(0)), dark, str(net)
 
 
@@ -162,6 +175,17 @@ def _islands(layer: Any, error: float) -> Iterator[tuple[BaseGeometry, str]]:
         yield island, next((named[k][1] for k in hits), "")
 
 
+def _line(primitive: Any, error: float) -> list[tuple[float, float]]:
+    """Points of a stroke's centre line, straight or an arc."""
+    ends = [(primitive.x1, primitive.y1), (primitive.x2, primitive.y2)]
+    if not hasattr(primitive, "cx"):
+        return ends
+    from gerbonara.graphic_primitives import ArcPoly
+
+    center = (primitive.clockwise, (primitive.cx, primitive.cy))
+    return [*_chords(ArcPoly(ends, [center, None]), error), ends[-1]]
+
+
 def _edges(layer: Any, error: float) -> Iterator[BaseGeometry]:
     """Centre lines of a drawn outline [mm]."""
     from gerbonara.utils import MM
@@ -169,13 +193,7 @@ def _edges(layer: Any, error: float) -> Iterator[BaseGeometry]:
     for item in layer.objects:
         for primitive in item.to_primitives(unit=MM):
             if hasattr(primitive, "x1"):
-                ends = [(primitive.x1, primitive.y1), (primitive.x2, primitive.y2)]
-                if hasattr(primitive, "cx"):
-                    from gerbonara.graphic_primitives import ArcPoly
-
-                    center = (primitive.clockwise, (primitive.cx, primitive.cy))
-                    ends = [*_chords(ArcPoly(ends, [center, None]), error), ends[-1]]
-                yield LineString(ends)
+                yield LineString(_line(primitive, error))
             else:
                 yield Polygon(_chords(primitive.to_arc_poly(), error)).exterior
 
