@@ -26,7 +26,7 @@ from capsense.errors import (
 )
 from capsense.fleet import Fleet, FleetReading
 from capsense.layout import load_layout
-from capsense.layout.model import Layout
+from capsense.layout.model import BoardLayout
 from capsense.plotting import plot
 from capsense.reading import Reading, StepStats
 from capsense.readout import Readout
@@ -53,10 +53,10 @@ from capsense.viewer import show
 __version__: str
 
 __all__ = [
-    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "Body", "Box", "CapSenseError",
+    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "BoardLayout", "Body", "Box", "CapSenseError",
     "Capsule", "Client", "Counts", "Cylinder", "DeformableSurface", "DepthFrame", "Design",
     "DesignError", "Ellipsoid", "ExperimentalWarning", "FieldError", "Fleet", "FleetReading",
-    "Layers", "Layout", "LayoutError", "Material", "MeshError", "MissingDependencyError",
+    "Layers", "LayoutError", "Material", "MeshError", "MissingDependencyError",
     "OrthographicCamera", "PartialError", "PerspectiveCamera", "Pose", "ProtocolError", "Reading",
     "Readout", "ReadoutError", "Recorder", "RecordingError", "Scenario", "ScenarioError", "Scene",
     "SceneError", "ServerError", "Simulator", "Skin", "SkinError", "SolveError", "Sphere",

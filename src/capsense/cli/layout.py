@@ -12,7 +12,7 @@ from capsense.errors import LayoutError
 
 if TYPE_CHECKING:
     from capsense.layout.convert import BoardDesign
-    from capsense.layout.model import Layout
+    from capsense.layout.model import BoardLayout
 
 
 def _millimetres(text: str) -> float:
@@ -107,7 +107,7 @@ def layout(args: argparse.Namespace) -> int:
     return OK
 
 
-def _listing(found: Layout) -> str:
+def _listing(found: BoardLayout) -> str:
     """The nets of a layout as text, the largest first."""
     from capsense.layout.model import polygons_of
 
@@ -125,7 +125,7 @@ def _listing(found: Layout) -> str:
     ])  # fmt: skip
 
 
-def _facts(found: Layout) -> list[tuple[str, str]]:
+def _facts(found: BoardLayout) -> list[tuple[str, str]]:
     levels = ", ".join(f"{k} at {z * 1e3:.4g} mm" for k, z in found.heights.items())
     slabs = ", ".join(
         f"{s.name} (εr {s.eps_r:g}, {(s.z[1] - s.z[0]) * 1e3:.4g} mm)" for s in found.slabs
@@ -138,7 +138,7 @@ def _facts(found: Layout) -> list[tuple[str, str]]:
             ("dielectrics", slabs or "none")]  # fmt: skip
 
 
-def _next(path: Path, found: Layout) -> str:
+def _next(path: Path, found: BoardLayout) -> str:
     """A command that takes the likely electrodes of a layout."""
     import re
 

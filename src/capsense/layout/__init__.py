@@ -1,6 +1,6 @@
 """Layouts of boards from CAD: copper of each net, stack-up and outline, made into a design.
 
-One reader per format yields a :class:`Layout`; :func:`capsense.layout.convert.convert` makes a
+One reader per format yields a :class:`BoardLayout`; :func:`capsense.layout.convert.convert` makes a
 design of it.
 """
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from capsense._validate import as_number
 from capsense.errors import LayoutError
-from capsense.layout.model import Layout
+from capsense.layout.model import BoardLayout
 
 READERS = {
     ".kicad_pcb": "kicad",
@@ -27,7 +27,9 @@ READERS = {
 """Module of this package that reads a file with this ending; folders are told by what they hold."""
 
 
-def load_layout(path: str | Path, *, tolerance: float = 2e-5, thickness: float = 1.6e-3) -> Layout:
+def load_layout(
+    path: str | Path, *, tolerance: float = 2e-5, thickness: float = 1.6e-3
+) -> BoardLayout:
     """Read the layout of a board.
 
     Args:

@@ -10,7 +10,7 @@ from shapely.geometry.base import BaseGeometry
 
 from capsense.errors import LayoutError, require_package
 from capsense.layout.curves import even_odd, outline_of, quarter_segments
-from capsense.layout.model import Layout
+from capsense.layout.model import BoardLayout
 from capsense.layout.stl import OUTLINES, level_layout
 
 _UNITS = {1: 25.4, 2: 304.8, 4: 1.0, 5: 10.0, 6: 1000.0, 13: 1e-3}
@@ -18,7 +18,7 @@ _UNITS = {1: 25.4, 2: 304.8, 4: 1.0, 5: 10.0, 6: 1000.0, 13: 1e-3}
 _KINDS = ("LINE", "ARC", "CIRCLE", "ELLIPSE", "LWPOLYLINE", "POLYLINE", "SPLINE", "HATCH", "SOLID")
 
 
-def read(path: Path, error: float, thickness: float) -> Layout:
+def read(path: Path, error: float, thickness: float) -> BoardLayout:
     """Read a drawing; closed outlines are areas, those within others holes.
 
     Raises:
@@ -65,7 +65,7 @@ def _width(item: Any) -> float:
 def drawn_layout(
     name: str, areas: dict[str, list[BaseGeometry]], lines: dict[str, list[BaseGeometry]],
     thickness: float,
-) -> Layout:  # fmt: skip
+) -> BoardLayout:  # fmt: skip
     """A layout of closed areas [mm] by net, and of loose lines that close areas together.
 
     A name that ends in a zero byte holds strokes, which are united; others follow even and odd.

@@ -19,10 +19,10 @@ from shapely.geometry.base import BaseGeometry
 from capsense.errors import LayoutError, require_package
 from capsense.layout.curves import outline_of, quarter_segments
 from capsense.layout.kicad import FR4
-from capsense.layout.model import Layout, Slab, gather, in_metres, polygons_of, united
+from capsense.layout.model import BoardLayout, Slab, gather, in_metres, polygons_of, united
 
 
-def read(path: Path, error: float, thickness: float) -> Layout:
+def read(path: Path, error: float, thickness: float) -> BoardLayout:
     """Read a set; nets are islands of copper that drills join, or those that the files name.
 
     Raises:
@@ -65,7 +65,7 @@ def read(path: Path, error: float, thickness: float) -> Layout:
     count = max(len(copper) - 1, 1)
     heights = {name: -whole * k / count + 0.0 for k, name in enumerate(copper)}
     pieces = _joined(copper, drills)
-    return Layout(
+    return BoardLayout(
         path.name, gather(pieces, in_metres), {k: z * 1e-3 for k, z in heights.items()},
         (Slab("board", FR4, (-whole * 1e-3, 0.0)),),
         None if outline is None else in_metres(outline), notes=tuple(notes),

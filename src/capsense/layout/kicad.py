@@ -21,7 +21,7 @@ from shapely.geometry.base import BaseGeometry
 from capsense._validate import read_file
 from capsense.errors import LayoutError
 from capsense.layout.curves import arc_through, bezier, outline_of, quarter_segments
-from capsense.layout.model import UNCONNECTED, Layout, Slab, gather, in_metres, united
+from capsense.layout.model import UNCONNECTED, BoardLayout, Slab, gather, in_metres, united
 
 Node = list["str | Node"]
 XY = tuple[float, float]
@@ -93,7 +93,7 @@ def word(node: Node, name: str, default: str = "") -> str:
 
 
 @dataclass
-class _Reader:
+class _BoardReader:
     """What is gathered from a board; millimetres, y up."""
 
     board: Node
@@ -436,7 +436,7 @@ def _stack(
     return heights, [Slab("board", FR4, (-whole * 1e-3, 0.0))], mask, notes
 
 
-def read(path: Path, error: float, thickness: float) -> Layout:
+def read(path: Path, error: float, thickness: float) -> BoardLayout:
     """Read a board; lengths in millimetres.
 
     Raises:
@@ -448,7 +448,7 @@ def read(path: Path, error: float, thickness: float) -> Layout:
         raise LayoutError(f"{path} cannot be read: {cause}; save it anew in KiCad") from None
     if board[:1] != ["kicad_pcb"]:
         raise LayoutError(f"{path} is no board of KiCad; it begins with {board[:1]}")
-    reader = _Reader(board, error)
+    reader = _BoardReader(board, error)
     try:
         reader.read()
     except (ValueError, IndexError, TypeError) as cause:
@@ -467,7 +467,7 @@ def read(path: Path, error: float, thickness: float) -> Layout:
             + (f" ({open_ends} loose ends)" if open_ends else "") + "; the board is taken as the "
             "rectangle around the copper."
         )  # fmt: skip
-    return Layout(
+    return BoardLayout(
         path.name, gather(reader.pieces, in_metres),
         {name: z * 1e-3 for name, z in heights.items()}, tuple(slabs),
         None if outline is None else in_metres(outline),

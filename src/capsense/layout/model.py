@@ -34,7 +34,7 @@ class Slab:
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class BoardLayout:
     """Copper of a board by net and layer, and what is around it.
 
     Lengths in metres, in the axes of the board: x and y as its file has them, y up; z = 0 at the

@@ -10,14 +10,14 @@ from shapely.geometry.base import BaseGeometry
 
 from capsense.errors import LayoutError
 from capsense.layout.curves import even_odd
-from capsense.layout.model import Layout
+from capsense.layout.model import BoardLayout
 from capsense.layout.stl import OUTLINES, level_layout
 
 LEVEL = 1e-3
 """Faces whose corners differ in height by less than this [mm] are level."""
 
 
-def read(path: Path, error: float, thickness: float) -> Layout:
+def read(path: Path, error: float, thickness: float) -> BoardLayout:
     """Read a file; lengths in millimetres, as Open CASCADE converts them.
 
     Raises:

@@ -10,7 +10,7 @@ from shapely.geometry.base import BaseGeometry
 
 from capsense.design.stl import read_stl
 from capsense.errors import LayoutError
-from capsense.layout.model import Layout, gather, in_metres, united
+from capsense.layout.model import BoardLayout, gather, in_metres, united
 
 OUTLINES = ("outline", "board", "edge", "edge_cuts", "edge.cuts")
 """Names, in lower case, of what is the board and no net."""
@@ -18,7 +18,7 @@ LEVEL = 1e-3
 """Faces whose corners differ in height by less than this [mm] are level."""
 
 
-def read(path: Path, error: float, thickness: float) -> Layout:
+def read(path: Path, error: float, thickness: float) -> BoardLayout:
     """Read a folder; of a body with thickness the upper faces count.
 
     Raises:
@@ -48,7 +48,7 @@ def read(path: Path, error: float, thickness: float) -> Layout:
 def level_layout(
     name: str, pieces: list[tuple[str, float, BaseGeometry]], outline: list[BaseGeometry],
     thickness: float,
-) -> Layout:  # fmt: skip
+) -> BoardLayout:  # fmt: skip
     """A layout of copper at heights [mm] on a board of FR4; layers are named by their height."""
     levels = sorted({z for _, z, _ in pieces}, reverse=True)
     names = {z: f"z = {z - levels[0] + 0.0:g} mm" for z in levels}
@@ -56,7 +56,7 @@ def level_layout(
     from capsense.layout.model import Slab
 
     depth = max(thickness, levels[0] - levels[-1]) if levels else thickness
-    return Layout(
+    return BoardLayout(
         name, gather(((n, names[z], s) for n, z, s in pieces), in_metres),
         {names[z]: (z - levels[0]) * 1e-3 for z in levels},
         (Slab("board", FR4, (-depth * 1e-3, 0.0)),),

@@ -13,12 +13,12 @@ from shapely.geometry.base import BaseGeometry
 from capsense.errors import LayoutError, require_package
 from capsense.layout.curves import even_odd, quarter_segments
 from capsense.layout.dxf import drawn_layout
-from capsense.layout.model import Layout
+from capsense.layout.model import BoardLayout
 
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 
 
-def read(path: Path, error: float, thickness: float) -> Layout:
+def read(path: Path, error: float, thickness: float) -> BoardLayout:
     """Read a drawing; a net is named by the label or id of an element or of its group.
 
     Raises:

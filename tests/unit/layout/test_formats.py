@@ -12,7 +12,7 @@ from approximate import approx
 import capsense as cs
 
 
-def found(layout: cs.Layout) -> dict[str, tuple[float, int]]:
+def found(layout: cs.BoardLayout) -> dict[str, tuple[float, int]]:
     """Area [mm²] and islands of each net."""
     return {
         net: (1e6 * sum(s.area for s in v.values()), sum(len(s.geoms) for s in v.values()))
