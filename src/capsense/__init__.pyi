@@ -53,7 +53,8 @@ from capsense.viewer import show
 __version__: str
 
 __all__ = [
-    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "BoardLayout", "Body", "Box", "CapSenseError",
+    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "BoardLayout", "Body", "Box",
+    "CapSenseError",
     "Capsule", "Client", "Counts", "Cylinder", "DeformableSurface", "DepthFrame", "Design",
     "DesignError", "Ellipsoid", "ExperimentalWarning", "FieldError", "Fleet", "FleetReading",
     "Layers", "LayoutError", "Material", "MeshError", "MissingDependencyError",
