@@ -84,7 +84,7 @@ def foam_field(
     foam: tuple[cs.Design, BackgroundField], monkeypatch: pytest.MonkeyPatch
 ) -> cs.Design:
     """The design of :func:`foam`; whoever asks for its field meanwhile gets the rough one."""
-    for module in ("capsense.fleet", "capsense.simulator"):
+    for module in ("capsense.fleet.fleet", "capsense.simulator"):
         monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: foam[1])
     return foam[0]
 

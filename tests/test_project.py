@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
 import sys
 import tomllib
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -79,6 +81,32 @@ def test_every_package_is_core_or_not() -> None:
     }
     outside = {"capsense.bench", "capsense.mesh"}  # a command; Gmsh, which is an extra
     assert there - outside <= set(sides)
+
+
+def test_no_module_imports_what_imports_it() -> None:
+    """Imports in functions and for type checkers count; those of a package's own name do not."""
+    source = ROOT / "src"
+    files = {
+        ".".join(path.relative_to(source).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in (source / "capsense").rglob("*.py")
+    }
+
+    def imported(path: Path) -> set[str]:
+        out = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                out |= {name.name for name in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{path} has a relative import; write the full name"
+                names = {f"{node.module}.{name.name}" for name in node.names}
+                out |= {name if name in files else str(node.module) for name in names}
+        return out & files.keys()
+
+    graph = {module: imported(path) for module, path in files.items()}
+    try:
+        list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        pytest.fail(f"modules import each other: {' <- '.join(error.args[1])}")
 
 
 def test_changelog_has_sections_for_users() -> None:

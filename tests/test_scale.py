@@ -124,7 +124,7 @@ def test_fleets_scale(device: str, monkeypatch: pytest.MonkeyPatch):
     readings = []
     for scale in (1.0, 1e-3):
         sim = _simulator(scale)
-        monkeypatch.setattr("capsense.fleet.load_or_build", lambda *_, s=sim: s.background)
+        monkeypatch.setattr("capsense.fleet.fleet.load_or_build", lambda *_, s=sim: s.background)
         bodies = [
             cs.Body(cs.Sphere(8e-4 * scale), grounding="floating"),
             cs.Body(cs.Box((2e-3 * scale, 1e-3 * scale, 5e-4 * scale))),

@@ -18,7 +18,7 @@ import capsense as cs
 from capsense.adapters import skin as skin_module
 from capsense.fleet.bodies import BodyTable
 from capsense.masked import MaskedScenes
-from capsense.readout.conversions import SideBySide
+from capsense.readout.side_by_side import SideBySide
 from capsense.solver.surface_solver import SurfaceSolver
 
 

@@ -13,8 +13,8 @@ from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
 from capsense.errors import BatchError, SolveError
-from capsense.field.background import CapacitanceChange
 from capsense.masked import MaskedScenes
+from capsense.reading import CapacitanceChange
 from capsense.solver import surface_solver as solver
 from capsense.solver.surface_solver import SurfaceSolver, View
 

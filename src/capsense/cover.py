@@ -111,18 +111,6 @@ class Cover:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Touch:
-    """What bodies press onto the cover of a design, for each of its M electrodes."""
-
-    force: Array
-    """Force that the cover carries above each electrode [N], shape (M,)."""
-    compression: Array
-    """Largest compression of the cover above each electrode [m], shape (M,)."""
-    total: float
-    """Force that the whole cover carries [N]."""
-
-
 class Viscosity:
     """Force of one contact over time: hysteresis, then relaxation, of the elastic force.
 

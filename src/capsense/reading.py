@@ -1,20 +1,66 @@
-"""What a sensor reads at an instant."""
+"""Results: what sensors read, and what solvers find of a scene."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.cover import Touch
-
 if TYPE_CHECKING:
-    from capsense.field.background import Charges
     from capsense.readout.conversions import Counts, Held
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """What bodies press onto the cover of a design, for each of its M electrodes."""
+
+    force: Array
+    """Force that the cover carries above each electrode [N], shape (M,)."""
+    compression: Array
+    """Largest compression of the cover above each electrode [m], shape (M,)."""
+    total: float
+    """Force that the whole cover carries [N]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Charges:
+    """Charges that the terminals draw onto the bodies."""
+
+    points: Array
+    """Where they sit [m], shape (n, 3)."""
+    density: Array
+    """Size of the surface density for each terminal at 1 V [C/m²], shape (n, terminals)."""
+    pitch: float
+    """Usual distance of neighbours [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CapacitanceChange:
+    """What a scene changes in the Maxwell matrix of all terminals."""
+
+    matrix: Array
+    """Change of the matrix [F], shape (terminals, terminals)."""
+    error: float
+    """Estimated error of its largest entry [F]; infinite where an electrode lies inside a body."""
+    iterations: int = 0
+    """Iterations of the linear solver; 0 for a direct one."""
+    unknowns: int = 0
+    """Unknowns that were solved for, for each terminal."""
+    loss: Array | None = None
+    """Part of the change in quadrature [F], the same shape, where matter has losses: the complex
+    capacitance is ``matrix - 1j * loss``."""
+    jacobian: Array | None = None
+    """How the matrix changes with the poses of the scene's bodies, where it was asked for, shape
+    (bodies, terminals, terminals, 6)."""
+    touch: Touch | None = None
+    """What its bodies press onto the cover, if the design has one."""
+    reason: Callable[[], str] = str
+    """Tells what most of the error comes from; nothing, if that is not known."""
 
 
 class KeptField(Protocol):
@@ -142,3 +188,66 @@ class Reading:
         out = -self.capacitance
         np.fill_diagonal(out, 0.0)
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class FleetReading:
+    """What the sensors of all environments see; e environments, s sensors, n electrodes.
+
+    Arrays of NumPy on the CPU, else of Warp, in single precision, which PyTorch and JAX take by
+    DLPack; those are written anew by the next step.
+    """
+
+    capacitance: Any
+    """Maxwell capacitance matrices [F], shape (e, s, n, n)."""
+    delta: Any
+    """Their change by the bodies [F], shape (e, s, n, n)."""
+    electrode_names: tuple[str, ...]
+    error: Any = None
+    """Estimated error of the largest entry [F], shape (e, s)."""
+    shield_coupling: Any = None
+    """Charge on each electrode per volt on all shields together [F], shape (e, s, n), in double
+    precision."""
+    conductance: Any = None
+    """Conductance that matter with losses adds [S], shape (e, s, n, n); None on the CPU where
+    there is none."""
+    held: Held | None = None
+    """What the chips' registers hold, where there is a readout, each of shape (e, s, channels)."""
+    jacobian: Any = None
+    """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
+    about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
+
+    touch: FleetTouch | None = None
+    """What is pressed onto the cover, if the design has one; without relaxation and hysteresis."""
+
+    @property
+    def self_capacitance(self) -> Array:
+        """As of :class:`Reading` [F], shape (e, s, n); copied from the device."""
+        own = np.diagonal(_on_host(self.capacitance), axis1=-2, axis2=-1)
+        if self.shield_coupling is None:
+            return own.copy()
+        return np.asarray(own + _on_host(self.shield_coupling))
+
+    @property
+    def mutual_capacitance(self) -> Array:
+        """As of :class:`Reading` [F], shape (e, s, n, n); copied from the device."""
+        out = -_on_host(self.capacitance)
+        out[..., range(out.shape[-1]), range(out.shape[-1])] = 0.0
+        return np.asarray(out)
+
+
+@dataclass(frozen=True, eq=False)
+class FleetTouch:
+    """What bodies press onto the covers of all sensors, see :class:`Touch`."""
+
+    force: Any
+    """Force that the cover carries above each electrode [N], shape (e, s, n)."""
+    compression: Any
+    """Largest compression of the cover above each electrode [m], shape (e, s, n)."""
+    total: Any
+    """Force that the whole cover carries [N], shape (e, s)."""
+
+
+def _on_host(values: Any) -> Any:
+    """An array of NumPy with the same numbers."""
+    return values if isinstance(values, np.ndarray) else values.numpy()

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from capsense._frozen import read_only
 from capsense._thread_pool import ForkSafeRLock, ThreadPool, some_failed
 from capsense._validate import as_number, checked_frequency, shorten
-from capsense.cover import Touch
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError
-from capsense.field.background import BackgroundField, BuildSettings, CapacitanceChange, Terminals
+from capsense.field.background import BackgroundField, BuildSettings, Terminals
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.reading import KeptField, Reading, StepStats
+from capsense.reading import CapacitanceChange, KeptField, Reading, StepStats, Touch
 from capsense.scene import Scene
 from capsense.scene.contact import warn_of_contact, warn_of_doubt
 from capsense.scene.depth import DepthFrame

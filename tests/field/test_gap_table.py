@@ -14,14 +14,9 @@ from capsense.design import parse_design
 from capsense.design.model import Design
 from capsense.field.boundary import Accuracy, BoundarySolution
 from capsense.field.face import has_even_face, plane_panels
-from capsense.field.gap_table import (
-    GapTable,
-    PlaneResponse,
-    build_gap_table,
-    from_arrays,
-    to_arrays,
-)
+from capsense.field.gap_table import PlaneResponse, build_gap_table
 from capsense.field.green_points import is_flat
+from capsense.field.plane_tables import GapTable, from_arrays, to_arrays
 
 UNIT = 1.2e-3
 PAD = """

@@ -12,9 +12,9 @@ from capsense.errors import ReadoutError
 from capsense.fleet import Fleet
 from capsense.readout import Readout
 from capsense.readout.channels import Wiring, self_patterns
-from capsense.readout.conversions import SideBySide
 from capsense.readout.noise import allan_deviation
 from capsense.readout.presets import CHIPS
+from capsense.readout.side_by_side import SideBySide
 
 COUNT, NAMES = 5, tuple(f"E{k}" for k in range(1, 7))
 

@@ -33,7 +33,7 @@ def design(request, covered, monkeypatch):
     if request.param != "covered":
         return request.param
     found, field = covered
-    for module in ("capsense.fleet", "capsense.simulator"):
+    for module in ("capsense.fleet.fleet", "capsense.simulator"):
         monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: field)
     return found
 

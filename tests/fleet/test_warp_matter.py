@@ -103,7 +103,7 @@ def test_floating_conductors_of_the_design(monkeypatch):
     """Differential: the last electrode of a design is cut off and floats, a field beside it."""
     whole = load_design("six_patch")
     field = load_or_build(whole, default_settings(whole))
-    for module in ("capsense.fleet", "capsense.simulator"):
+    for module in ("capsense.fleet.fleet", "capsense.simulator"):
         monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: field)
     *kept, loose = whole.electrodes
     conductor = Conductor(loose.name, Role.FLOATING, loose.surface)

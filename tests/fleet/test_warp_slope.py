@@ -55,7 +55,7 @@ def test_jacobian_with_floating_conductors_of_the_design(monkeypatch):
     """Differential: two electrodes of the design are cut off and float."""
     whole = load_design("six_patch")
     field = load_or_build(whole, default_settings(whole))
-    for module in ("capsense.fleet", "capsense.simulator"):
+    for module in ("capsense.fleet.fleet", "capsense.simulator"):
         monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: field)
     loose = [Conductor(x.name, Role.FLOATING, x.surface) for x in whole.electrodes[4:]]
     design = replace(whole, electrodes=whole.electrodes[:4], conductors=(*whole.conductors, *loose))

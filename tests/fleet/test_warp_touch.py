@@ -115,7 +115,7 @@ def fabric_design(request, field_cache, monkeypatch) -> cs.Design:
     top = request.param
     with tiny_field.few_sources():
         field = load_or_build(covered_discs(top=top), tiny_field.SETTINGS, cache_dir=field_cache)
-    for module in ("capsense.fleet", "capsense.simulator"):
+    for module in ("capsense.fleet.fleet", "capsense.simulator"):
         monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: field)
     return covered_discs(top=top, bending_length=3e-3 if top == "ground" else 0.0)
 

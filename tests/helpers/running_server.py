@@ -13,7 +13,8 @@ from collections.abc import Callable
 from typing import Any
 
 from capsense.server.client import Client
-from capsense.server.server import Limits, Server, ServerOptions
+from capsense.server.options import Limits, ServerOptions
+from capsense.server.server import Server
 
 WAIT = 120.0
 """Longest wait for a server to start or stop, and for whatever else must happen [s]."""

@@ -14,7 +14,7 @@ from capsense.readout.channels import Pattern, Wiring, mutual_patterns
 from capsense.readout.converter import Range
 from capsense.readout.noise import allan_deviation
 from capsense.readout.presets import CHIPS, ReadoutOptions, Status, schedule_of
-from capsense.readout.presets import build as build_chip
+from capsense.readout.readout import build as build_chip
 
 COUNT = 12
 NAMES = tuple(f"E{k}" for k in range(COUNT))

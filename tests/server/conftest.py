@@ -12,7 +12,7 @@ pytest.importorskip("websockets", reason='needs websockets: pip install "capsens
 from running_server import RunningServer
 from stopped_clock import StoppedClock
 
-from capsense.server import session
+from capsense.server import connection
 
 
 @pytest.fixture(scope="session")
@@ -34,5 +34,5 @@ def dome() -> np.ndarray:
 def clock(monkeypatch: pytest.MonkeyPatch) -> StoppedClock:
     """What allowances look at."""
     clock = StoppedClock()
-    monkeypatch.setattr(session, "time", clock)
+    monkeypatch.setattr(connection, "time", clock)
     return clock

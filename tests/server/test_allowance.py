@@ -5,7 +5,7 @@ from __future__ import annotations
 from approximate import approx
 from stopped_clock import StoppedClock
 
-from capsense.server.session import Allowance
+from capsense.server.connection import Allowance
 
 
 def test_spends_what_is_there_and_what_comes_back(clock: StoppedClock) -> None:

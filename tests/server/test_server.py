@@ -10,8 +10,9 @@ from running_server import WAIT, RunningServer, wait_for
 
 import capsense as cs
 from capsense.errors import CapSenseError, ProtocolError, ServerError
+from capsense.server.options import Limits, ServerOptions
 from capsense.server.sensor import ServedSensor
-from capsense.server.server import Limits, Server, ServerOptions
+from capsense.server.server import Server
 from capsense.simulator import Simulator
 
 TOKEN = "correct horse"

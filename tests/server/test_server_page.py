@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from running_server import WAIT, RunningServer
 
-from capsense.server.server import Limits
+from capsense.server.options import Limits
 
 PAGE = (Path(__file__).parents[2] / "docs" / "server.md").read_text(encoding="utf-8")
 URL = "ws://127.0.0.1:8765"

@@ -9,8 +9,8 @@ import pytest
 from running_server import RunningServer
 
 import capsense as cs
-from capsense.cover import Touch
 from capsense.errors import ProtocolError
+from capsense.reading import Touch
 from capsense.server import CONVERSION, ReadingMessage, pack_reading, unpack_reading
 from capsense.server.messages import MessageTable, read_poses, read_scene
 from capsense.server.sensor import scene_message

@@ -24,8 +24,8 @@ from running_server import WAIT, RunningServer, wait_for
 from stopped_clock import StoppedClock
 
 from capsense.errors import ProtocolError
-from capsense.server import HEADER, pack_depth, session
-from capsense.server.session import AdmissionControl, RateLimitedConnection
+from capsense.server import HEADER, connection, pack_depth
+from capsense.server.connection import AdmissionControl, RateLimitedConnection
 
 
 @pytest.fixture(autouse=True)
@@ -133,7 +133,7 @@ def test_newcomers_are_let_in_slowly(
     clock: StoppedClock, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beyond so many in a second, they are closed; those before stay, later ones come in."""
-    monkeypatch.setattr(session, "ARRIVALS", 3)
+    monkeypatch.setattr(connection, "ARRIVALS", 3)
     with RunningServer() as server, server.client() as client:
         sensor = client.open()
         server.client().close()

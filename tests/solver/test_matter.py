@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from approximate import approx
 
-from capsense.solver.tree.matter import UNIT, Matter
+from capsense.constants import UNIT
+from capsense.solver.tree.matter import Matter
 
 INF = math.inf
 

@@ -31,6 +31,7 @@ from capsense._dense import (
     subtract_product,
     whole_lines,
 )
+from capsense.constants import UNIT
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.solver.bodies.blocks import free_block
@@ -54,7 +55,7 @@ from capsense.solver.system.step import (
 from capsense.solver.system.system_kernels import Reduced, _products, factorise, reduced
 from capsense.solver.tree import tree_kernels
 from capsense.solver.tree.dynamic_surface import DynamicBody
-from capsense.solver.tree.matter import CONDUCTING, UNIT
+from capsense.solver.tree.matter import CONDUCTING
 from capsense.solver.tree.mean_kernels import quadrature4
 from capsense.solver.tree.rigid import BODY, Clusters, RigidShape, rigid_shape, split
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from capsense.cover import Touch
+from capsense.reading import Touch
 from capsense.viewer.charts import (
     MAX_NUMBERS,
     MAX_POINTS,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.viewer.charts import NEAR, OCTAVES, Plane, is_flat, levels, palette, region
+from capsense.viewer.plane import NEAR, OCTAVES, Plane, is_flat, levels, palette, region
 
 
 @pytest.fixture(scope="module")

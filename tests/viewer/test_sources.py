@@ -12,7 +12,7 @@ import pytest
 import capsense as cs
 from capsense.errors import ProtocolError, RecordingError, ServerError
 from capsense.scenario import parse_scenario
-from capsense.viewer.charts import Plane, region
+from capsense.viewer.plane import Plane, region
 from capsense.viewer.source import Frame, RecordingSource, ScenarioSource
 
 DATA = {

@@ -19,7 +19,7 @@ from view_sources import Queued, until
 import capsense as cs
 from capsense._style import LOUD, QUIET
 from capsense.errors import ProtocolError, ServerError
-from capsense.viewer.charts import Plane, region
+from capsense.viewer.plane import Plane, region
 from capsense.viewer.player import Follower
 from capsense.viewer.scene_drawing import SHADES, SceneDrawing
 from capsense.viewer.view import LiveView, check_address

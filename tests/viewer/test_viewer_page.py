@@ -19,7 +19,7 @@ from headless_browser import BROWSERS, browser_page, browser_path
 
 import capsense as cs
 from capsense.scenario import Scenario, parse_scenario
-from capsense.viewer.charts import palette
+from capsense.viewer.plane import palette
 from capsense.viewer.player import Player
 from capsense.viewer.source import ScenarioSource
 from capsense.viewer.view import LiveView

@@ -31,7 +31,6 @@ from capsense.adapters.rules import (
     ImageOptions,
     Rules,
     SeenOptions,
-    as_material,
     split_rules,
 )
 from capsense.design.model import Design
@@ -40,7 +39,7 @@ from capsense.readout import Readout
 from capsense.readout.config import make_readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
-from capsense.scene.materials import Grounding
+from capsense.scene.materials import Grounding, checked_material
 from capsense.scene.pose import checked_pose
 from capsense.simulator import DEFAULT_DESIGN, Simulator
 
@@ -165,7 +164,7 @@ def attach(
     simulator = make_simulator(design)
     image = Image.of(other, simulator.design)
     chip = None if readout is None else make_readout(readout, simulator)
-    material = as_material(rules.default_material) if "default_material" in options else None
+    material = checked_material(rules.default_material) if "default_material" in options else None
     paint = None
     if vision_sensor is None:  # all is checked: only now the scene is changed
         paint = Paint(remote, rules, carrier(remote, handle) if rules.exclude_own else None)

@@ -20,7 +20,7 @@ from capsense.adapters.parallel import FleetOptions, ParallelSensors, WorldShape
 from capsense.adapters.rules import Rules, split_rules
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.fleet import FleetReading
+from capsense.reading import FleetReading
 from capsense.scene import Shape
 from capsense.simulator import DEFAULT_DESIGN
 

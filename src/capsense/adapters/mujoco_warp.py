@@ -20,7 +20,7 @@ from capsense.adapters.parallel import (
 )
 from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
-from capsense.fleet import FleetReading
+from capsense.reading import FleetReading
 from capsense.scene import Body, Pose, Shape
 from capsense.simulator import DEFAULT_DESIGN
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
-from capsense.fleet import Fleet, FleetReading
+from capsense.fleet import Fleet
+from capsense.reading import FleetReading
 from capsense.scene import Body
 from capsense.simulator import PresetName
 from capsense.solver.tree.matter import matter_of

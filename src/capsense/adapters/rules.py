@@ -12,8 +12,8 @@ import numpy as np
 from capsense._validate import as_number, as_whole, shorten, suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.scene import Body, Material, Pose, Shape, material
-from capsense.scene.materials import Grounding, checked_grounding
+from capsense.scene import Body, Material, Pose, Shape
+from capsense.scene.materials import Grounding, checked_grounding, checked_material
 
 Names = tuple[str, ...]
 """The names that one solid answers to, such as those of its geom and of its body."""
@@ -102,12 +102,12 @@ class Rules:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        for key, checked in (("materials", as_material), ("grounding", checked_grounding)):
+        for key, checked in (("materials", checked_material), ("grounding", checked_grounding)):
             value = getattr(self, key) or {}
             if not isinstance(value, Mapping):
                 raise SceneError(f"{key} is {value!r}; give a dict of name patterns")
             put(self, key, {pattern: checked(v) for pattern, v in value.items()})
-        put(self, "default_material", as_material(self.default_material))
+        put(self, "default_material", checked_material(self.default_material))
         put(self, "default_grounding", checked_grounding(self.default_grounding))
         put(self, "exclude", _patterns("exclude", self.exclude))
         put(self, "hull", _patterns("hull", self.hull))
@@ -133,8 +133,8 @@ class Rules:
         """The material of something; ``own`` is what the model says of it."""
         for pattern, value in (self.materials or {}).items():
             if matches(pattern, names):
-                return as_material(value)
-        return as_material(self.default_material) if own is None else own
+                return checked_material(value)
+        return checked_material(self.default_material) if own is None else own
 
     def tie_of(self, names: Names, own: Tie | None = None) -> Tie:
         """What ties something to ground; ``own`` is what the model says of it."""
@@ -253,15 +253,6 @@ def _patterns(what: str, patterns: object) -> tuple[str, ...]:
     return out
 
 
-def as_material(value: Material | str) -> Material:
-    """A material, from itself or its name.
-
-    Raises:
-        SceneError: No such material.
-    """
-    return value if isinstance(value, Material) else material(value)
-
-
 def read_grounding(text: str, where: str) -> Grounding:
     """A grounding written in a simulator's model: a word, or farads.
 
@@ -286,6 +277,6 @@ def read_material(text: str, where: str) -> Material:
         SceneError: There is no such material.
     """
     try:
-        return material(text.strip())
+        return checked_material(text.strip())
     except SceneError as error:
         raise SceneError(f"{where}: {error}") from None

@@ -214,13 +214,8 @@ def _build(args: argparse.Namespace, recording: CapacitanceRecord) -> dict[str, 
     """The readouts asked for, by a name for files."""
     from capsense.readout.channels import ChannelBank
     from capsense.readout.config import load_readout
-    from capsense.readout.presets import (
-        ReadoutOptions,
-        build,
-        chip_of,
-        default_patterns,
-        expected_of,
-    )
+    from capsense.readout.presets import ReadoutOptions, chip_of, default_patterns, expected_of
+    from capsense.readout.readout import build
 
     if args.config is not None:
         return {args.config.stem: load_readout(args.config, recording.electrodes)}

@@ -17,7 +17,8 @@ from capsense.cli import OK, RATE, BuildProgress, arg, command, progress_shown, 
 from capsense.cli.run import build_simulator, chosen_scenario
 
 if TYPE_CHECKING:
-    from capsense.server.server import Limits, Server
+    from capsense.server.options import Limits
+    from capsense.server.server import Server
     from capsense.viewer.player import Playback
     from capsense.viewer.view import LiveView
 
@@ -68,7 +69,8 @@ def serve(args: argparse.Namespace) -> int:
     """
     import asyncio
 
-    from capsense.server.server import Server, ServerOptions
+    from capsense.server.options import ServerOptions
+    from capsense.server.server import Server
 
     options = ServerOptions(
         tuple(args.design), args.readout, args.host, args.port, read_token(args.token_file),
@@ -83,7 +85,7 @@ def serve(args: argparse.Namespace) -> int:
 
 
 def _limits(args: argparse.Namespace) -> Limits:
-    from capsense.server.server import Limits
+    from capsense.server.options import Limits
 
     values = {name: getattr(args, f"max_{name}") for name in _LIMITS}
     return Limits(**{name: value for name, value in values.items() if value is not None})

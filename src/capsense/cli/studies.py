@@ -77,7 +77,8 @@ def dataset(args: argparse.Namespace) -> int:
     """
     from tqdm import tqdm
 
-    from capsense.learning.shards import load_data_set, missing, require_pyarrow, run
+    from capsense.learning.data_sets import load_data_set
+    from capsense.learning.shards import missing, require_pyarrow, run
 
     require_pyarrow()
     spec = load_data_set(args.spec)

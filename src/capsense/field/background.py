@@ -1,4 +1,4 @@
-"""The field of a design in its empty domain, and what solvers tell of the scenes in it."""
+"""The field of a design in its empty domain."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.cover import Touch
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
@@ -130,42 +129,6 @@ def build_background(
     green = replace(green, unit=unit)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)
-
-
-@dataclass(frozen=True, eq=False)
-class CapacitanceChange:
-    """What a scene changes in the Maxwell matrix of all terminals."""
-
-    matrix: Array
-    """Change of the matrix [F], shape (terminals, terminals)."""
-    error: float
-    """Estimated error of its largest entry [F]; infinite where an electrode lies inside a body."""
-    iterations: int = 0
-    """Iterations of the linear solver; 0 for a direct one."""
-    unknowns: int = 0
-    """Unknowns that were solved for, for each terminal."""
-    loss: Array | None = None
-    """Part of the change in quadrature [F], the same shape, where matter has losses: the complex
-    capacitance is ``matrix - 1j * loss``."""
-    jacobian: Array | None = None
-    """How the matrix changes with the poses of the scene's bodies, where it was asked for, shape
-    (bodies, terminals, terminals, 6)."""
-    touch: Touch | None = None
-    """What its bodies press onto the cover, if the design has one."""
-    reason: Callable[[], str] = str
-    """Tells what most of the error comes from; nothing, if that is not known."""
-
-
-@dataclass(frozen=True, eq=False)
-class Charges:
-    """Charges that the terminals draw onto the bodies."""
-
-    points: Array
-    """Where they sit [m], shape (n, 3)."""
-    density: Array
-    """Size of the surface density for each terminal at 1 V [C/m²], shape (n, terminals)."""
-    pitch: float
-    """Usual distance of neighbours [m]."""
 
 
 class Terminals:

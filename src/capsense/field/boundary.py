@@ -17,7 +17,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
-from capsense.constants import EPS0
+from capsense.constants import UNIT
 from capsense.design.geometry import Facet
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
@@ -263,7 +263,7 @@ class BoundarySolution:
         rhs[driven] = potentials[owner[driven]]
         if sources is not None:
             rhs += self._source_terms(sources)
-        return 4 * math.pi * EPS0 * scipy.linalg.lu_solve(self._lu, rhs)
+        return UNIT * scipy.linalg.lu_solve(self._lu, rhs)
 
     def solve(self, sides: Array) -> Array:
         """Charge densities over 4π eps0 of right-hand sides in the order of the panels, (n, k)."""
@@ -306,7 +306,7 @@ class BoundarySolution:
     def potential(self, points: Array, densities: Array, chunk: int = 2000) -> Array:
         """Potential [V] of charge densities at points [m], shape (n, 3) -> (n, k)."""
         out = np.empty((len(points), densities.shape[1]))
-        scaled = densities / (4 * math.pi * EPS0)
+        scaled = densities / UNIT
         for start in range(0, len(points), chunk):
             block = np.ascontiguousarray(points[start : start + chunk])
             matrix = kernels.potential_matrix(block, self.model.floor, self.model.panels)

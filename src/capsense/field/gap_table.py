@@ -11,16 +11,16 @@ the plane, and plates of the electrodes' size and less, the energy that they hav
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from capsense.constants import EPS0
+from capsense.constants import EPS0, UNIT
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
 from capsense.field.bem_kernels import Panels
@@ -31,21 +31,19 @@ from capsense.field.boundary import (
     BoundarySolution,
 )
 from capsense.field.face import plane_panels, sheet_on_face, top_of
+from capsense.field.green import GreenFunction
 from capsense.field.panels import (
     concatenate,
     samples,
 )
-from capsense.field.pressed_table import PressedTable, pressed_table_of
-
-if TYPE_CHECKING:
-    from capsense.field.green import GreenFunction
+from capsense.field.plane_tables import GapTable
+from capsense.field.pressed_table import pressed_table_of
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Plate = tuple[Ints, slice]
 """Panels of a plane, and the electrodes in front of which they are."""
 
-UNIT = 4 * math.pi * EPS0
 _HEIGHTS = 0.03 * 2.1 ** np.arange(8)
 """Distances of the plane, over the clearance of the Green's function."""
 _SOUGHT = 0.25
@@ -68,67 +66,6 @@ _CELLS = 16_000
 """At most about so many cells."""
 _LEAST = 0.003
 """Columns that change less than this part of a terminal's own are left out."""
-
-
-@dataclass(frozen=True, eq=False)
-class GapTable:
-    """What a grounded plane near the face of a design changes in the charges of its terminals."""
-
-    validity: float
-    """Distance h0 from the design [m] from which the Green's function holds."""
-    top: float
-    """Height of the face of the design [m], from which distances count."""
-    heights: Array
-    """Distances z of the plane from the face [m], ascending, shape (k,)."""
-    points: NDArray[np.float32]
-    """Centres of the cells, in coordinates of the face (:mod:`capsense.field.face`) [m], (c, 3)."""
-    areas: NDArray[np.float32]
-    """Their areas [m²], shape (c,)."""
-    terminal: NDArray[np.int64]
-    """Terminal of each cell, -1 for grounded sheets, ascending, shape (c,)."""
-    series: NDArray[np.float32]
-    """Distance that adds to z in series [m]: (z + series) T is nearly constant, shape (c,)."""
-    columns: NDArray[np.int64]
-    """Terminals j of the columns of each terminal (the last row: of grounded sheets), -1 for none,
-    shape (t + 1, n)."""
-    change: NDArray[np.float32]
-    """(z + series) T_ij / eps0, with the plane at 1 V in the last column, shape (c, k, n + 1)."""
-    blocks: NDArray[np.int64]
-    """First cell of each block of neighbouring cells of one terminal, ascending, shape (q,)."""
-    pressed: PressedTable | None = None
-    """What compression of the cover changes, if it gives way."""
-
-
-_PREFIX, _PRESSED = "gap_", "pressed_"
-
-
-def to_arrays(table: GapTable) -> dict[str, NDArray[Any]]:
-    """All of a table, each name after ``gap_`` or ``pressed_``; changes in half precision."""
-    own = {name: value for name, value in vars(table).items() if name != "pressed"}
-    out = {_PREFIX + name: np.asarray(value) for name, value in own.items()}
-    change = np.asarray(table.change).transpose(2, 1, 0)  # packs better
-    out[_PREFIX + "change"] = change.astype(np.float16)
-    if table.pressed is not None:
-        out |= {_PRESSED + name: np.asarray(value) for name, value in vars(table.pressed).items()}
-        for name in ("change", "sheet_density"):
-            out[_PRESSED + name] = out[_PRESSED + name].astype(np.float16)
-    return out
-
-
-def from_arrays(arrays: Mapping[str, Any]) -> GapTable | None:
-    """Undo :func:`to_arrays`; None where there is no table."""
-    if _PREFIX + "change" not in arrays:
-        return None
-    own = [f.name for f in fields(GapTable) if f.name != "pressed"]
-    values: dict[str, Any] = {name: np.asarray(arrays[_PREFIX + name]) for name in own}
-    change = np.ascontiguousarray(values["change"].transpose(2, 1, 0), np.float32)
-    numbers = {name: float(values[name]) for name in ("validity", "top")}
-    if _PRESSED + "strains" in arrays:
-        parts = {f.name: np.asarray(arrays[_PRESSED + f.name]) for f in fields(PressedTable)}
-        for name in ("change", "sheet_density"):
-            parts[name] = np.ascontiguousarray(parts[name], np.float32)
-        values["pressed"] = PressedTable(**parts)
-    return GapTable(**{**values, **numbers, "change": change})
 
 
 class GroundedPlane(NamedTuple):

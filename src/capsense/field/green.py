@@ -25,9 +25,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from capsense.errors import FieldError
-from capsense.field import gap_table
+from capsense.field import plane_tables
 from capsense.field.boundary import BoundarySolution
-from capsense.field.gap_table import GapTable
 from capsense.field.green_points import (
     GreenSettings,
     Surroundings,
@@ -37,6 +36,7 @@ from capsense.field.green_points import (
     training_points,
     wall_sources,
 )
+from capsense.field.plane_tables import GapTable
 
 Array = NDArray[np.float64]
 Table = NDArray[np.float32]
@@ -234,7 +234,7 @@ def build_green(
 def to_arrays(green: GreenFunction) -> dict[str, NDArray[Any]]:
     """All of a Green's function by the names of its fields."""
     out = {name: np.asarray(value) for name, value in vars(green).items() if name != "gap"}
-    return out if green.gap is None else out | gap_table.to_arrays(green.gap)
+    return out if green.gap is None else out | plane_tables.to_arrays(green.gap)
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> GreenFunction:
@@ -251,7 +251,7 @@ def from_arrays(arrays: Mapping[str, Any]) -> GreenFunction:
         return given if given.ndim else float(given)
 
     own = {f.name: value(f.name) for f in fields(GreenFunction) if f.name != "gap"}
-    return GreenFunction(**own, gap=gap_table.from_arrays(arrays))
+    return GreenFunction(**own, gap=plane_tables.from_arrays(arrays))
 
 
 def _weight(distances: Array) -> Array:

@@ -7,8 +7,7 @@ at some strains, follow the charge densities of the terminals below it, and thos
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +19,7 @@ from capsense.design.geometry import level_rectangle
 from capsense.design.model import Conductor, Design, Role
 from capsense.field.boundary import POWER, Accuracy, BoundarySolution, terminals
 from capsense.field.panels import PLANE_TOL, samples
-
-if TYPE_CHECKING:
-    from capsense.field.gap_table import GapTable
+from capsense.field.plane_tables import GapTable, PressedTable
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -39,26 +36,6 @@ _CELLS = 4000
 _SEEN = 4
 """So many terminals are kept for each of them, those that it screens most."""
 _PLANE = "plane on the cover"
-
-
-@dataclass(frozen=True, eq=False)
-class PressedTable:
-    """Charge densities below a cover that is compressed, times its thickness over eps0 [V]."""
-
-    strains: Array
-    """Compression over thickness, ascending from 0, shape (k,)."""
-    change: Single
-    """What the density on each cell of the gap table changes by from contact on, with each terminal
-    of its columns at 1 V, and the plane at 1 V in the last column, shape (c, k, n + 1); no cells
-    below a fabric."""
-    sheet_points: Single
-    """Cells of the fabric [m], shape (f, 2); none without one."""
-    sheet_areas: Single
-    """Their areas [m²], shape (f,)."""
-    sheet_terminals: Ints
-    """Terminals that they screen most, -1 for none, shape (f, m)."""
-    sheet_density: Single
-    """Density on them, with these terminals at 1 V, shape (f, k, m)."""
 
 
 def pressed_design(design: Design, cover: Cover, strain: float) -> Design:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from capsense.fleet import Fleet
+from capsense.fleet.fleet import Fleet
 
 
 def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = None) -> torch.Tensor:

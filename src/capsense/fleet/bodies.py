@@ -1,20 +1,16 @@
-"""What stands in the places of a fleet's environments, what their sensors read, and how that is
-compared with finer readings."""
+"""What stands in the places of a fleet's environments."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_whole, shorten
 from capsense.errors import SceneError
-from capsense.readout.conversions import Held
-from capsense.scene import Body, Layers, Pose, Scene, SurfaceMesh
-from capsense.simulator import PresetName, Simulator
+from capsense.scene import Body, Layers, SurfaceMesh
 from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import windowed
 from capsense.solver.surface_solver import SurfaceSolver
@@ -22,102 +18,12 @@ from capsense.solver.tree.dynamic_surface import DynamicBody
 from capsense.solver.tree.matter import matter_of
 from capsense.solver.tree.rigid import BODY, RigidShape
 
-if TYPE_CHECKING:
-    from capsense.fleet import Fleet
-
 Array = NDArray[np.float64]
 
 WORLD: Array = np.array([0.0] * 6 + [1.0])
 """The pose of the world's own frame."""
 _QUATERNION = 1e-3
 """Quaternions may be longer or shorter than 1 by so much; they are made 1 long."""
-
-
-@dataclass(frozen=True, eq=False)
-class FleetReading:
-    """What the sensors of all environments see; e environments, s sensors, n electrodes.
-
-    Arrays of NumPy on the CPU, else of Warp, in single precision, which PyTorch and JAX take by
-    DLPack; those are written anew by the next step.
-    """
-
-    capacitance: Any
-    """Maxwell capacitance matrices [F], shape (e, s, n, n)."""
-    delta: Any
-    """Their change by the bodies [F], shape (e, s, n, n)."""
-    electrode_names: tuple[str, ...]
-    error: Any = None
-    """Estimated error of the largest entry [F], shape (e, s)."""
-    shield_coupling: Any = None
-    """Charge on each electrode per volt on all shields together [F], shape (e, s, n), in double
-    precision."""
-    conductance: Any = None
-    """Conductance that matter with losses adds [S], shape (e, s, n, n); None on the CPU where
-    there is none."""
-    held: Held | None = None
-    """What the chips' registers hold, where there is a readout, each of shape (e, s, channels)."""
-    jacobian: Any = None
-    """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
-    about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
-
-    touch: FleetTouch | None = None
-    """What is pressed onto the cover, if the design has one; without relaxation and hysteresis."""
-
-    @property
-    def self_capacitance(self) -> Array:
-        """As of :class:`Reading` [F], shape (e, s, n); copied from the device."""
-        own = np.diagonal(_on_host(self.capacitance), axis1=-2, axis2=-1)
-        if self.shield_coupling is None:
-            return own.copy()
-        return np.asarray(own + _on_host(self.shield_coupling))
-
-    @property
-    def mutual_capacitance(self) -> Array:
-        """As of :class:`Reading` [F], shape (e, s, n, n); copied from the device."""
-        out = -_on_host(self.capacitance)
-        out[..., range(out.shape[-1]), range(out.shape[-1])] = 0.0
-        return np.asarray(out)
-
-
-@dataclass(frozen=True, eq=False)
-class FleetTouch:
-    """What bodies press onto the covers of all sensors, see :class:`~capsense.cover.Touch`."""
-
-    force: Any
-    """Force that the cover carries above each electrode [N], shape (e, s, n)."""
-    compression: Any
-    """Largest compression of the cover above each electrode [m], shape (e, s, n)."""
-    total: Any
-    """Force that the whole cover carries [N], shape (e, s)."""
-
-
-@dataclass(frozen=True)
-class FleetCheck:
-    """Errors of some environments against :class:`Simulator`, over each one's largest entry."""
-
-    environments: tuple[int, ...]
-    """Which environments."""
-    rms: float
-    """Root of the mean square over all entries."""
-    worst: float
-    """The largest."""
-    where: tuple[int, int]
-    """Environment and sensor that have it."""
-    contact: tuple[tuple[int, int], ...] = ()
-    """Environments and sensors whose readings mean nothing: a bare electrode lies inside a body,
-    or touches a conductor."""
-    lifted: tuple[tuple[int, int], ...] = ()
-    """Environments and sensors whose readings lack the first millimetres in front of a design:
-    of conductors where matter has losses, which the readings that they are compared with lack, too.
-    On Warp also of dielectrics, of all bodies near a bent film, and where more than 8 conductors
-    that are not at ground are near.
-    Gaps between bodies that Warp does not resolve are part of ``rms`` and ``worst``.
-    """
-
-
-def _on_host(values: Any) -> Any:
-    """An array of NumPy with the same numbers."""
-    return values if isinstance(values, np.ndarray) else values.numpy()
 
 
 def on_device(values: Any) -> bool:
@@ -323,91 +229,6 @@ def _require_conductors(bodies: Sequence[Body | None], frequency: float) -> None
                 f"a body of {body.material.name!r} stands in a place that is joined with others; "
                 "only conductors can be joined"
             )
-
-
-def compare(
-    fleet: Fleet, poses: ArrayLike, sensors: ArrayLike | None, samples: int, seed: int
-) -> FleetCheck:
-    """See :meth:`Fleet.check`."""
-    if fleet.finer is None:
-        raise ValueError(
-            'the fleet has preset "fine", and there is no finer one to check it against; '
-            'make one with preset="standard"'
-        )
-    whole = as_whole(samples)
-    if whole is None or whole < 1:
-        raise ValueError(f"samples is {shorten(samples)}; give a whole number from 1")
-    e, s, b = fleet.count, fleet.sensors, fleet.places
-    where = checked_poses("poses", poses, (e, b, 7))
-    at = np.broadcast_to(WORLD, (e, s, 7))
-    if sensors is not None:
-        at = checked_poses("sensors", sensors, (e, s, 7))
-    delta = fleet.solved(where, at).delta
-    found = delta if isinstance(delta, np.ndarray) else delta.numpy()
-    rows = np.random.default_rng(seed).permutation(e)[:whole]
-    group = fleet.table.bodies.group
-    joined = len(np.unique(group)) < len(group)
-    finer = _by_fleet if joined else _by_simulator
-    truth, contact = finer(fleet, fleet.finer, rows, where[rows], at[rows])
-    scale = np.maximum(np.abs(truth).max(axis=(2, 3), keepdims=True), 1e-18)
-    errors = np.abs(found[rows] - truth) / scale
-    row, sensor = np.unravel_index(errors.max(axis=(2, 3)).argmax(), contact.shape)
-    return FleetCheck(
-        tuple(rows.tolist()), float(np.sqrt((errors**2).mean())), float(errors.max()),
-        (int(rows[row]), int(sensor)),
-        *(
-            tuple((int(rows[k]), int(j)) for k, j in np.argwhere(some))
-            for some in (contact, fleet.lifted(where, at, rows))
-        ),
-    )  # fmt: skip
-
-
-def _by_simulator(
-    fleet: Fleet, preset: PresetName, rows: NDArray[np.int64], where: Array, at: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Changes of the matrices in some environments [F], and where bodies touch electrodes."""
-    simulator = Simulator(
-        fleet.design, excitation_frequency=fleet.excitation_frequency, preset=preset
-    )
-    truth = np.empty((*at.shape[:2], *fleet.baseline.shape))
-    contact = np.zeros(at.shape[:2], np.bool_)
-    for k, j in np.ndindex(contact.shape):
-        frame = Pose(at[k, j, :3], at[k, j, 3:]).inverse()
-        bodies = zip(
-            fleet.table.given[rows[k]], where[k], fleet.table.bodies.hidden[j], strict=True
-        )
-        reading = simulator.step(
-            Scene(
-                body.moved(frame @ Pose(pose[:3], pose[3:]))
-                for body, pose, hidden in bodies
-                if body is not None and not hidden
-            )
-        )
-        truth[k, j] = reading.delta
-        contact[k, j] = reading.stats.solver_error >= np.abs(reading.capacitance).max()
-    return truth, contact
-
-
-def _by_fleet(
-    fleet: Fleet, preset: PresetName, rows: NDArray[np.int64], where: Array, at: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """The same by a finer fleet, whose places are joined alike."""
-    given, known = fleet.table.given[rows], fleet.table.bodies
-    some: Body = next(body for body in fleet.table.given.ravel() if body is not None)
-    finer = type(fleet)(
-        fleet.design, [some] * fleet.places, len(rows), sensors=fleet.sensors, preset=preset,
-        excitation_frequency=fleet.excitation_frequency,
-    )  # fmt: skip
-    for place in range(fleet.places):
-        finer.change(place, given[:, place].tolist())
-    for sensor, hidden in enumerate(known.hidden):
-        finer.hide(sensor, np.flatnonzero(hidden).tolist())
-    for number in np.unique(known.group):
-        places = np.flatnonzero(known.group == number).tolist()
-        if len(places) > 1:
-            finer.join(places)
-    reading = finer.solved(where, at)
-    return reading.delta, reading.error >= np.abs(reading.capacitance).max(axis=(2, 3))
 
 
 def require_no_gradient(what: str, values: Any) -> None:

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense._thread_pool import in_parts
+from capsense.constants import UNIT
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
 from capsense.field.face_kernels import WALL_FADE_LENGTH
 from capsense.field.green_kernels import Green
-from capsense.fleet.bodies import Bodies, BodyTable, FleetReading, FleetTouch
+from capsense.fleet.bodies import Bodies, BodyTable
+from capsense.reading import FleetReading, FleetTouch
 from capsense.solver.gap.gap_kernels import near_bodies
 from capsense.solver.gap.touch_kernels import Foundation, press
 from capsense.solver.surface_solver import SurfaceSolver
 from capsense.solver.system.lossy import solve_lossy
 from capsense.solver.system.step import slopes_of, solve
-from capsense.solver.tree.matter import FLOATING_PENALTY, UNIT
+from capsense.solver.tree.matter import FLOATING_PENALTY
 from capsense.solver.tree.rigid import BODY, HALF_SPACE
 
 Array = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Chips of one kind on Warp as kernels: a thread is one channel of one chip.
 
-The twin is :class:`~capsense.readout.conversions.SideBySide`; converters have the laws of
+The twin is :class:`~capsense.readout.side_by_side.SideBySide`; converters have the laws of
 :mod:`capsense.readout.laws`. All in double precision.
 """
 

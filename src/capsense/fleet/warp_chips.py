@@ -1,6 +1,6 @@
 """Chips of one kind on Warp, one for each sensor of a fleet, with noise and drift of their own.
 
-The twin is :class:`~capsense.readout.conversions.SideBySide`: the same channels, schedule, stages
+The twin is :class:`~capsense.readout.side_by_side.SideBySide`: the same channels, schedule, stages
 and converters in double precision, but other random numbers.
 """
 

@@ -17,10 +17,11 @@ from capsense.fleet import warp_cut, warp_fabric, warp_gap, warp_near, warp_slop
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
-from capsense.fleet.bodies import Bodies, FleetTouch, on_device
+from capsense.fleet.bodies import Bodies, on_device
 from capsense.fleet.warp_chips import WarpChips
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
+from capsense.reading import FleetTouch
 from capsense.readout import Readout
 from capsense.solver.gap.touch_kernels import COARSE, FINE
 from capsense.solver.surface_solver import SurfaceSolver

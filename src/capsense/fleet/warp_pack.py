@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from capsense.constants import UNIT
 from capsense.field.background import Terminals
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet.bodies import Bodies
 from capsense.solver.surface_solver import SurfaceSolver
-from capsense.solver.tree.matter import UNIT
 from capsense.solver.tree.rigid import RigidShape
 
 

@@ -20,8 +20,7 @@ from capsense.fleet.warp_cut import (
     row,
     smooth,
 )
-from capsense.solver.interaction.pair_kernels import _WIDE as WIDE
-from capsense.solver.interaction.pair_kernels import WALL_PENALTY
+from capsense.solver.interaction.pair_kernels import WALL_PENALTY, WIDE_CLUSTER
 from capsense.solver.tree.mean_kernels import FAR
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -30,7 +29,7 @@ COLUMNS = 8
 """Columns that a thread works out at a time."""
 some = wp.types.vector(length=COLUMNS, dtype=wp.float32)
 pulls = wp.types.matrix(shape=(COLUMNS, 6), dtype=wp.float32)
-_WIDTH, _COLUMNS, _FAR, _WIDE = (wp.constant(x) for x in (WIDTH, COLUMNS, FAR, WIDE))
+_WIDTH, _COLUMNS, _FAR, _WIDE = (wp.constant(x) for x in (WIDTH, COLUMNS, FAR, WIDE_CLUSTER))
 _WALL_PENALTY, _STIFF = wp.constant(WALL_PENALTY), wp.constant(600.0)
 """Energy of charge that is out of reach [1/m]; with losses at most the second number [m] over the
 square of a large cluster's extent: more of it would hide what is in reach, see ``warp_cut.weigh``.

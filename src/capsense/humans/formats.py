@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import suggest
 from capsense.errors import MissingDependencyError, SceneError
-from capsense.humans.limb import Limb, LimbPart, Segment
+from capsense.humans.chain import Chain, LimbPart, Segment
 from capsense.scene import Material, Pose, TriMesh, material
 from capsense.scene.materials import Grounding, checked_grounding
 
@@ -127,7 +127,7 @@ _BETWEEN_MASS = 1e-3
 
 
 def to_mjcf(
-    limb: Limb,
+    limb: Chain,
     pose: Pose = Pose(),  # noqa: B008, a pose is immutable
     *,
     material_name: str = "human",
@@ -162,7 +162,7 @@ def to_mjcf(
     return _text(root)
 
 
-def mjcf_body(limb: Limb, pose: Pose = Pose(), *, damping: float = 1.0) -> str:  # noqa: B008
+def mjcf_body(limb: Chain, pose: Pose = Pose(), *, damping: float = 1.0) -> str:  # noqa: B008
     """The ``<body>`` element of a limb, to be pasted into a model that counts in degrees.
 
     Args:
@@ -173,7 +173,7 @@ def mjcf_body(limb: Limb, pose: Pose = Pose(), *, damping: float = 1.0) -> str: 
     return _text(_mjcf_element(limb, pose, damping))
 
 
-def to_urdf(limb: Limb) -> str:
+def to_urdf(limb: Chain) -> str:
     """A URDF of a limb; its base link is its frame at the shoulder or hip.
 
     Links are named ``right_arm_forearm``, joints ``right_arm_elbow_flexion``. Where a segment has
@@ -206,7 +206,7 @@ def to_urdf(limb: Limb) -> str:
     return _text(root)
 
 
-def _mjcf_element(limb: Limb, pose: Pose, damping: float) -> Element:
+def _mjcf_element(limb: Chain, pose: Pose, damping: float) -> Element:
     x, y, z, w = pose.quaternion
     base = Element("body", name=limb.name, pos=_numbers(pose.position), quat=_numbers((w, x, y, z)))
     above = base

@@ -25,7 +25,6 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from importlib import resources
 from statistics import NormalDist
 from types import MappingProxyType
@@ -35,9 +34,11 @@ import numpy as np
 
 from capsense._validate import suggest
 from capsense.errors import SceneError
-from capsense.scene import Body, Capsule, Material, Pose
+from capsense.humans.chain import Chain, Joint, LimbPart, Segment
+from capsense.humans.formats import to_mjcf, to_urdf
+from capsense.scene import Body, Material, Pose
 from capsense.scene.materials import Grounding, checked_grounding
-from capsense.scene.pose import Vec3, checked_pose
+from capsense.scene.pose import checked_pose
 
 Sex = Literal["female", "male"]
 Side = Literal["left", "right"]
@@ -145,69 +146,8 @@ def _within(name: str, value: object, low: float, high: float, unit: str) -> Non
 
 
 @dataclass(frozen=True)
-class LimbPart:
-    """A capsule of a segment, in the segment's frame."""
-
-    start: Vec3
-    """Centre of one cap [m]."""
-    end: Vec3
-    """Centre of the other cap [m]."""
-    radius: float
-    """Radius [m]."""
-
-    @cached_property
-    def shape(self) -> Capsule:
-        """The solid."""
-        return Capsule(self.radius, math.dist(self.start, self.end))
-
-    @cached_property
-    def pose(self) -> Pose:
-        """Where the solid stands in the segment's frame."""
-        start, end = np.array(self.start), np.array(self.end)
-        x, y, z = (end - start) / np.linalg.norm(end - start)
-        turn = (1.0, 0.0, 0.0, 0.0) if z < -1 + 1e-12 else (-y, x, 0.0, 1.0 + z)
-        return Pose(0.5 * (start + end), turn)
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A hinge at the origin of a segment."""
-
-    name: str
-    axis: Vec3
-    """Unit axis in the segment's frame, after the joints before it have turned."""
-    lower: float
-    """Smallest angle [rad]."""
-    upper: float
-    """Largest angle [rad]."""
-
-
-@dataclass(frozen=True)
-class Segment:
-    """A rigid segment; it hangs on the one before it."""
-
-    name: str
-    origin: Vec3
-    """Its joint centre [m] in the frame of the segment before, or of the limb."""
-    joints: tuple[Joint, ...]
-    """Its joints; the first turns all the others."""
-    parts: tuple[LimbPart, ...]
-    mass: float
-    """Mass [kg]."""
-
-
-@dataclass(frozen=True)
-class Limb:
+class Limb(Chain):
     """An arm or a leg; made by :func:`arm` and :func:`leg`."""
-
-    name: str
-    """Prefix of the names of its bodies, ``"right_arm"`` say."""
-    segments: tuple[Segment, ...]
-
-    @property
-    def joints(self) -> tuple[Joint, ...]:
-        """All joints in order, from the body outwards."""
-        return tuple(j for s in self.segments for j in s.joints)
 
     def forward(
         self, angles: Mapping[str, float] | None = None, *, degrees: bool = False
@@ -265,20 +205,12 @@ class Limb:
             for name, part in self.named_parts(segment)
         ]
 
-    def named_parts(self, segment: Segment) -> list[tuple[str, LimbPart]]:
-        """The parts of a segment with the names of their bodies."""
-        return [(f"{self.name}_{segment.name}_{k}", p) for k, p in enumerate(segment.parts, 1)]
-
     def mjcf(self, pose: Pose = Pose(), **options: object) -> str:  # noqa: B008
         """A MuJoCo model of the limb; see :func:`capsense.humans.formats.to_mjcf`."""
-        from capsense.humans.formats import to_mjcf
-
         return to_mjcf(self, pose, **options)  # type: ignore[arg-type]
 
     def urdf(self) -> str:
         """A URDF of the limb; see :func:`capsense.humans.formats.to_urdf`."""
-        from capsense.humans.formats import to_urdf
-
         return to_urdf(self)
 
     def _checked(self, angles: Mapping[str, float], degrees: bool) -> dict[str, float]:

@@ -361,8 +361,8 @@ def _limb(table: ScenarioTable) -> list[Body]:
     ends = np.array([p for part in segment.parts for p in (part.start, part.end)])
     middle = Pose(0.5 * (ends.min(axis=0) + ends.max(axis=0)))
     root = pose @ (limb.forward(bent, degrees=True)[segment.name] @ middle).inverse()
-    grounding = read_grounding(table) if "grounding" in table else 100e-12
-    material = read_material(table) if "material" in table else "human"
+    grounding = read_grounding(table, 100e-12)
+    material = read_material(table, "human")
     bodies = limb.bodies(root, bent, degrees=True, material=material, grounding=grounding)
     name = table.string("name")
     short = len(limb.name) + 1

@@ -81,21 +81,6 @@ class DataSet(ABC):
         """Write what else there is, once all shards are there."""
 
 
-def load_data_set(path: str | Path) -> DataSet:
-    """Load the file of a data set: of episodes if it names an ``environment``, else of scenes.
-
-    Raises:
-        ScenarioError: There is no such file, or anything in it is wrong.
-        DesignError: Something is wrong in the design file it names.
-        MissingDependencyError: Episodes need Gymnasium and MuJoCo.
-    """
-    from capsense._validate import read_toml
-    from capsense.learning import episodes, scenes
-
-    kind = read_toml(Path(path), "data set", ScenarioError)
-    return episodes.load_episodes(path) if "environment" in kind else scenes.load_spec(path)
-
-
 def files_named(texts: Iterable[str], folder: Path) -> dict[str, str]:
     """SHA-256 (hex) of the files among some texts, relative to a folder."""
     return {

@@ -19,7 +19,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -28,10 +28,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.constants import EPS0
 from capsense.errors import FieldError, SolveError
+from capsense.masked.mesh_sensor import MeshSensor
 from capsense.mesh.tetmesh import TetMesh
-
-if TYPE_CHECKING:
-    from capsense.masked import MeshSensor
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]

@@ -11,12 +11,12 @@ from typing import Any, Protocol, cast
 from capsense import _validate
 from capsense._validate import read_toml, suggest
 from capsense.errors import ReadoutError
-from capsense.readout import ReadingLike, Readout
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, Wiring, mutual_patterns, self_patterns
 from capsense.readout.converter import Detector, ExponentialTracker, SteppingTracker, Tracker
 from capsense.readout.laws import Law, ResonanceLaw, ShuntLaw
-from capsense.readout.presets import CHIPS, Chip, ReadoutOptions, build, chip_of, expected_of
+from capsense.readout.presets import CHIPS, Chip, ReadoutOptions, chip_of, expected_of
+from capsense.readout.readout import ReadingLike, Readout, build
 
 TOP_KEYS = (
     "chip", "rate", "period", "latency", "seed", "random", "expected", "capdac", "mode", "pairs",

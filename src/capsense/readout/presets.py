@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 from capsense._validate import as_number, read_toml, suggest
 from capsense.errors import ReadoutError
-from capsense.readout import Readout
 from capsense.readout.channels import ChannelBank, Pattern, Wiring, mutual_patterns, self_patterns
 from capsense.readout.checks import Array, require
 from capsense.readout.conversions import Schedule, idle_of
@@ -242,38 +241,32 @@ def chip_of(name: str) -> Chip:
     return CHIPS[key]
 
 
-def build(
-    chip: str | Chip, electrodes: Sequence[str], options: ReadoutOptions | None = None
-) -> Readout:
-    """A readout with a chip's figures.
+def parts_of(chip: Chip, electrodes: Sequence[str], options: ReadoutOptions) -> dict[str, Any]:
+    """What a :class:`~capsense.readout.Readout` with a chip's figures is made of, by keyword.
 
     Args:
-        chip: A known chip's name, or a chip.
+        chip: The chip.
         electrodes: Electrode names in matrix order.
         options: What is chosen.
 
     Raises:
-        ReadoutError: No such chip, a rate it does not have, or an option is wrong.
+        ReadoutError: The chip does not have such a rate, or an option is wrong.
     """
-    part = chip if isinstance(chip, Chip) else chip_of(chip)
-    chosen = options or ReadoutOptions()
-    patterns = tuple(chosen.patterns) or default_patterns(part, electrodes)
+    patterns = tuple(options.patterns) or default_patterns(chip, electrodes)
     bank = ChannelBank(patterns, electrodes)
-    rate = part.rate(chosen.rate)
-    plan = schedule_of(part, patterns, 1.0 / rate.per_second - part.gap)
-    idle = idle_of(chosen.period, plan.period)
-    out = Readout(
-        bank,
-        dataclasses.replace(plan, idle=idle, latency=chosen.latency),
-        law_of(part, chosen, len(patterns)),
-        dac=_dac_of(part, chosen.capdac),
-        wiring=chosen.wiring,
-        stages=(*chosen.stages, *_stages(part, rate.rms, chosen)),
-        detector=chosen.detector or part.detector,
-        seed=chosen.seed,
-    )
-    out.name = part.title
-    return out
+    rate = chip.rate(options.rate)
+    plan = schedule_of(chip, patterns, 1.0 / rate.per_second - chip.gap)
+    idle = idle_of(options.period, plan.period)
+    return {
+        "bank": bank,
+        "schedule": dataclasses.replace(plan, idle=idle, latency=options.latency),
+        "law": law_of(chip, options, len(patterns)),
+        "dac": _dac_of(chip, options.capdac),
+        "wiring": options.wiring,
+        "stages": (*options.stages, *_stages(chip, rate.rms, options)),
+        "detector": options.detector or chip.detector,
+        "seed": options.seed,
+    }
 
 
 def default_patterns(chip: Chip, electrodes: Sequence[str]) -> tuple[Pattern, ...]:

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from capsense.codec import CHANGING, design_from_json, read_body, read_rest, read_shape
-from capsense.cover import Touch
 from capsense.errors import RecordingError, SceneError
-from capsense.reading import Reading, StepStats
+from capsense.reading import Reading, StepStats, Touch
 from capsense.readout.conversions import Counts
 from capsense.recording import (
     DESIGN,

@@ -1,18 +1,19 @@
 """Scenarios: a sensor, bodies that move in front of it, and how they are sampled."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
-
-import numpy as np
-
-from capsense import _validate
-from capsense._validate import MAX_LENGTH, UNITS, read_toml
-from capsense.codec import SHAPES, lengths_of
-from capsense.design import Design, load_design
-from capsense.errors import DesignError, MeshError, ScenarioError, SceneError
+from capsense.scenario.bodies import (
+    MAX_FORCE,
+    ScenarioTable,
+    read_bodies,
+    read_body,
+    read_grounding,
+    read_material,
+    read_pose,
+)
+from capsense.scenario.files import (
+    load_scenario,
+    parse_scenario,
+    read_design,
+)
 from capsense.scenario.model import (
     FORMER_METHODS,
     METHODS,
@@ -24,342 +25,25 @@ from capsense.scenario.model import (
     Trajectory,
     play,
 )
-from capsense.scene import Body, Material, Pose, Shape, TriMesh
-from capsense.scene.materials import Grounding
-from capsense.scene.surface import read_triangles
 
-if TYPE_CHECKING:
-    from capsense.simulator import Method
-
-
-class ScenarioTable(_validate.Table):
-    """One table of a scenario file; whatever is wrong raises :class:`ScenarioError`."""
-
-    error_type = ScenarioError
-
-
-MESH_KEYS = ("file", "unit")
-BODY_KEYS = ("name", "shape", "material", "grounding", "pose", "trajectory", "force")
-MAX_FORCE = 1e6
-"""No body is pressed onto a cover by more than this [N]."""
-TRAJECTORY_KEYS = ("waypoints", "speed", "dwell", "euler", "quaternion", "closed")
-MAX_GROUNDING = 1e-6
-"""No body is tied to ground by more than this [F]."""
-
-
-def read_body(table: ScenarioTable, name: str, folder: Path) -> MovingBody:
-    """Read one ``[[body]]``.
-
-    Args:
-        table: The table.
-        name: Its name, already read.
-        folder: Folder that mesh files are relative to.
-
-    Raises:
-        ScenarioError: A key, type or number is wrong.
-        SceneError: A shape or material is wrong.
-    """
-    shape_name = table.choice("shape", [*SHAPES, "mesh"])
-    lengths = MESH_KEYS if shape_name == "mesh" else tuple(lengths_of(shape_name))
-    table.only((*BODY_KEYS, *lengths))
-    shape = _read_shape(table, shape_name, folder)
-    material = read_material(table)
-    grounding = read_grounding(table)
-    if ("pose" in table) == ("trajectory" in table):
-        if "pose" in table:
-            raise table.error("pose and trajectory both say where it is; keep one of them")
-        raise table.error(
-            "missing key: give pose = { position = [x, y, z] }, or a [body.trajectory]"
-        )
-    trajectory = None
-    if "trajectory" in table:
-        sub = ScenarioTable(table.data["trajectory"], table.source, f"{table.item}: trajectory")
-        trajectory = _read_trajectory(sub)
-        pose = trajectory.pose_at(0.0)
-    else:
-        pose = read_pose(ScenarioTable(table.data["pose"], table.source, f"{table.item}: pose"))
-    force = table.number("force", 0.0, MAX_FORCE, unit="N") if "force" in table else None
-    return MovingBody(Body(shape, pose, material, grounding, name, force), trajectory)
-
-
-def _read_shape(table: ScenarioTable, shape: str, folder: Path) -> Shape:
-    if shape == "mesh":
-        return _read_mesh(table, folder)
-    lengths: list[Any] = [
-        table.length(key) if count == 1 else table.sizes(key, count, "[x, y, z] in metres")
-        for key, count in lengths_of(shape).items()
-    ]
-    return SHAPES[shape](*lengths)
-
-
-def _read_mesh(table: ScenarioTable, folder: Path) -> TriMesh:
-    file = table.string("file")
-    scale = UNITS[table.choice("unit", list(UNITS))]
-    path = folder / file
-    if not path.is_file():
-        raise table.error(
-            f"file = {file!r}: there is no file {path}; paths are relative to the scenario file"
-        )
-    if path.suffix.lower() not in (".stl", ".obj", ".ply", ".off"):
-        raise table.error(f"file = {file!r} is of no known kind; give .stl, .obj, .ply or .off")
-    try:
-        vertices, faces = read_triangles(path)
-    except SceneError as error:
-        raise table.error(f"file = {file!r} {error}") from None
-    extent = float(np.ptp(vertices, axis=0).max()) * scale
-    if extent > MAX_LENGTH:
-        raise table.error(
-            f'file = {file!r} is {extent:g} m across with unit = "{table.data["unit"]}", larger '
-            f"than {MAX_LENGTH:g} m; give the unit that the file is in"
-        )
-    return TriMesh(vertices * scale, faces)
-
-
-def read_material(table: ScenarioTable) -> Material | str:
-    """The material that ``material`` names or describes."""
-    value = table.raw("material", '"steel", or { eps_r = number, sigma = S/m }')
-    if isinstance(value, dict):
-        sub = ScenarioTable(value, table.source, f"{table.item}: material")
-        sub.only(("name", "eps_r", "sigma"))
-        return Material(
-            sub.string("name", "custom"),
-            sub.number("eps_r", 1.0, 1e6),
-            sub.number("sigma", 0.0, 1e9, 0.0, unit="S/m"),
-        )
-    return table.string("material")
-
-
-def read_grounding(table: ScenarioTable) -> Grounding:
-    """What ``grounding`` says; grounded by default."""
-    value = table.data.get("grounding", "grounded")
-    if isinstance(value, str):
-        choice = table.choice("grounding", ("grounded", "floating"), "grounded")
-        return "grounded" if choice == "grounded" else "floating"
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if value > MAX_GROUNDING:
-            raise table.error(
-                f"grounding = {value:g} F is more than {MAX_GROUNDING:g} F; the capacitance to "
-                f"ground is in farads; did you mean {value * 1e-12:g}?"
-            )
-        return value
-    raise table.error(
-        f'grounding = {value!r} must be "grounded", "floating", or a capacitance to ground in '
-        "farads, like 100e-12"
-    )
-
-
-def _rotations(table: ScenarioTable) -> list[Pose]:
-    """The rotations that ``euler`` or ``quaternion`` give; none if neither is there."""
-    if "euler" in table and "quaternion" in table:
-        raise table.error("euler and quaternion both turn it; keep one of them")
-    if "euler" in table:
-        angles = table.vectors("euler", 3, "[roll, pitch, yaw] in degrees")
-        for row in angles:
-            if max(abs(a) for a in row) > 360:
-                raise table.error(f"euler = {list(row)} must be within ±360 degrees")
-        return [Pose.from_euler((0, 0, 0), row, degrees=True) for row in angles]
-    if "quaternion" in table:
-        return [Pose((0, 0, 0), row) for row in table.unit_quaternions("quaternion")]
-    return []
-
-
-def read_pose(table: ScenarioTable) -> Pose:
-    """The pose that a table describes by ``position`` and ``euler`` or ``quaternion``."""
-    table.only(("position", "euler", "quaternion"))
-    position = table.coordinates("position", (3,))
-    rotations = _rotations(table) or [Pose()]
-    if len(rotations) > 1:
-        raise table.error(f"{len(rotations)} orientations for one position; give one")
-    return Pose(position, rotations[0].quaternion)
-
-
-def _read_trajectory(table: ScenarioTable) -> Trajectory:
-    table.only(TRAJECTORY_KEYS)
-    points = table.vectors("waypoints", 3, "[x, y, z] in metres")
-    for number, point in enumerate(points):
-        for value in point:
-            table.plausible(f"waypoints[{number}]", value)
-    rotations = _rotations(table) or [Pose()]
-    if len(rotations) not in (1, len(points)):
-        raise table.error(
-            f"{len(rotations)} orientations for {len(points)} waypoints; give one for all, or "
-            "one per waypoint"
-        )
-    closed = table.boolean("closed", False)
-    legs = len(points) if closed else len(points) - 1
-    speeds: tuple[float, ...] = ()
-    if legs or "speed" in table:
-        speeds = _each(table.series("speed", 1e-6, 1e3, "m/s"), legs)
-    dwell: tuple[float, ...] = ()
-    if "dwell" in table:
-        dwell = _each(table.series("dwell", 0.0, 1e7, "s"), len(points))
-    if len(rotations) == 1:
-        rotations *= len(points)
-    waypoints = tuple(
-        Pose(point, turn.quaternion) for point, turn in zip(points, rotations, strict=True)
-    )
-    try:
-        return Trajectory(waypoints, speeds, dwell, closed)
-    except ScenarioError as error:
-        raise table.error(str(error)) from None
-
-
-def _each(value: list[float] | float, count: int) -> tuple[float, ...]:
-    """One number for all, or as many as there are."""
-    return tuple(value) if isinstance(value, list) else (value,) * count
-
-
-TOP_KEYS = (
-    "name", "description", "design", "sample_rate", "duration", "excitation",
-    "pairs", "method", "body",
-)  # fmt: skip
-
-
-def load_scenario(path: str | Path) -> Scenario:
-    """Load a scenario file.
-
-    Args:
-        path: The ``.toml`` file. Designs and meshes it names are relative to its folder.
-
-    Raises:
-        ScenarioError: There is no such file, or anything in it is wrong; the message names the
-            file, the item, the value and the fix.
-        DesignError: Something is wrong in the design file it names.
-    """
-    file = Path(path)
-    data = read_toml(file, "scenario", ScenarioError)
-    return parse_scenario(data, source=file.name, folder=file.parent)
-
-
-def parse_scenario(
-    data: Mapping[str, Any], *, source: str = "scenario", folder: Path | None = None
-) -> Scenario:
-    """Build a checked scenario from the content of its file, given as nested dicts.
-
-    Args:
-        data: What ``tomllib`` makes of a scenario file.
-        source: Name of the file, for messages.
-        folder: Folder that designs and meshes are relative to; the current one by default.
-
-    Raises:
-        ScenarioError: Anything is wrong; the message names the item, the value and the fix.
-        DesignError: Something is wrong in the design file it names.
-    """
-    where = folder if folder is not None else Path()
-    top = ScenarioTable(data, source, "scenario")
-    _refuse_former(top)
-    top.only(TOP_KEYS)
-    name = top.string("name")
-    design = read_design(top, where)
-    sample_rate = top.number("sample_rate", 1e-3, 1e6, unit="Hz")
-    excitation = Excitation(top.choice("excitation", list(Excitation), Excitation.MATRIX.value))
-    pairs = _read_pairs(top, excitation, design)
-    bodies = read_bodies(top, where)
-    if not bodies and "duration" not in top:
-        raise top.error("has no body and no duration; add a [[body]], or duration = seconds")
-    ends = [b.trajectory.duration for b in bodies if b.trajectory is not None]
-    duration = top.number("duration", 0.0, 1e7, max(ends, default=0.0), unit="s")
-    try:
-        return Scenario(
-            name=name,
-            design=design,
-            bodies=bodies,
-            sample_rate=sample_rate,
-            duration=duration,
-            excitation=excitation,
-            pairs=pairs,
-            method=_read_method(top),
-            description=top.text("description"),
-        )
-    except ScenarioError as error:
-        raise top.error(str(error)) from None
-
-
-def _refuse_former(top: ScenarioTable) -> None:
-    """Say what to write instead of what files of earlier versions may hold."""
-    if "tolerance" in top:
-        raise top.error("tolerance is gone: no method needs one any more; remove the line")
-    if "method" in top and top.raw("method", "a method") == "perturbation":
-        raise top.error('method = "perturbation" is gone; write "surface", or remove the line')
-
-
-def _read_method(top: ScenarioTable) -> Method:
-    """The simulator's method, by its name or the one that earlier versions gave it."""
-    name = top.data.get("method")
-    if isinstance(name, str) and name in FORMER_METHODS:
-        return FORMER_METHODS[name]
-    return cast("Method", top.choice("method", METHODS, METHODS[0]))
-
-
-def read_design(top: ScenarioTable, folder: Path) -> Design:
-    """The design that ``design`` names: packaged, or a file relative to ``folder``.
-
-    Raises:
-        ScenarioError: There is no such design.
-        DesignError: Something is wrong in its file.
-    """
-    value = top.string("design")
-    is_path = value.endswith(".toml") or bool(set("/\\") & set(value))
-    path = folder / value
-    if is_path and not path.is_file():
-        raise top.error(
-            f"design = {value!r}: there is no file {path}; paths are relative to the scenario file"
-        )
-    try:
-        return load_design(path if is_path else value)
-    except DesignError as error:
-        if is_path:
-            raise
-        raise top.error(f"design = {value!r}: {error}") from None
-
-
-def _read_pairs(
-    top: ScenarioTable, excitation: Excitation, design: Design
-) -> tuple[tuple[str, str], ...]:
-    if "pairs" not in top:
-        if excitation is Excitation.MUTUAL and len(design.electrodes) < 2:
-            raise top.error(
-                f'excitation = "mutual" needs two electrodes; design {design.name!r} has one; '
-                'use excitation = "self"'
-            )
-        return ()
-    if excitation is not Excitation.MUTUAL:
-        raise top.error(f'pairs is for excitation = "mutual", not "{excitation}"; remove one')
-    what = 'a list of pairs of electrode names, like [["E1", "E2"]]'
-    out: list[tuple[str, str]] = []
-    names, owner = design.electrode_names, f"design {design.name!r}"
-    for number, pair in enumerate(top.pairs("pairs", what, names, owner)):
-        one, two = pair
-        if one == two:
-            raise top.error(f"pairs[{number}] = {[*pair]} must name two different electrodes")
-        if pair in out or (two, one) in out:
-            raise top.error(f"pairs[{number}] = {[*pair]} is listed twice; remove one")
-        out.append(pair)
-    return tuple(out)
-
-
-def read_bodies(top: ScenarioTable, folder: Path) -> tuple[MovingBody, ...]:
-    """Read the array of tables ``body``.
-
-    Args:
-        top: The table that holds it.
-        folder: Folder that mesh files are relative to.
-
-    Raises:
-        ScenarioError: Anything is wrong, or two bodies share a name.
-    """
-    out: list[MovingBody] = []
-    names: set[str] = set()
-    for number, raw in enumerate(top.tables("body"), start=1):
-        label = raw.get("name") if isinstance(raw, Mapping) else None
-        tag = f'body "{label}"' if isinstance(label, str) and label else f"body {number}"
-        table = ScenarioTable(raw, top.source, tag)
-        name = table.string("name")
-        if name in names:
-            raise table.error(f"two bodies are named {name!r}; names must differ")
-        names.add(name)
-        try:
-            out.append(read_body(table, name, folder))
-        except (SceneError, MeshError) as error:
-            raise table.error(str(error)) from None
-    return tuple(out)
+__all__ = [
+    "FORMER_METHODS",
+    "MAX_FORCE",
+    "METHODS",
+    "Channel",
+    "Excitation",
+    "MovingBody",
+    "Sample",
+    "Scenario",
+    "ScenarioTable",
+    "Trajectory",
+    "load_scenario",
+    "parse_scenario",
+    "play",
+    "read_bodies",
+    "read_body",
+    "read_design",
+    "read_grounding",
+    "read_material",
+    "read_pose",
+]

@@ -17,7 +17,7 @@ from capsense.scene.materials import (
     Grounding,
     Material,
     checked_grounding,
-    material,
+    checked_material,
 )
 from capsense.scene.scene import Body, Scene
 
@@ -140,7 +140,7 @@ class DepthFrame:
         if d.ndim == 2:
             d = d[None]
         known = np.empty(MAX_GROUPS)
-        one = _one_material(eps_r)
+        one = checked_material(eps_r) if isinstance(eps_r, Material | str) else None
         e = np.full((1, 1, 1), np.inf) if one else _checked_eps(eps_r, shape)
         if conducting is not None:
             mask = np.asarray(conducting)
@@ -235,13 +235,6 @@ def _checked_depth(depth: ArrayLike) -> Array:
             "columns)"
         )
     return d
-
-
-def _one_material(eps_r: object) -> Material | None:
-    """The material of all pixels, if one is named."""
-    if isinstance(eps_r, Material):
-        return eps_r
-    return material(eps_r) if isinstance(eps_r, str) else None
 
 
 def _checked_eps(eps_r: Any, shape: tuple[int, ...]) -> Array:

@@ -16,7 +16,7 @@ from importlib import resources
 from types import MappingProxyType
 from typing import Any, Literal, cast, get_args
 
-from capsense._validate import as_number, suggest
+from capsense._validate import as_number, nearest, shorten, suggest
 from capsense.constants import EPS0
 from capsense.errors import SceneError
 from capsense.scene.pose import as_float
@@ -215,6 +215,15 @@ def material(name: str) -> Material:
     )
 
 
+def checked_material(value: Material | str) -> Material:
+    """A material, from itself or its name.
+
+    Raises:
+        SceneError: There is no such material.
+    """
+    return value if isinstance(value, Material) else material(value)
+
+
 @dataclass(frozen=True)
 class GroundPath:
     """A capacitance to ground, with a resistance in series and one in parallel to both.
@@ -286,14 +295,20 @@ def checked_grounding(grounding: object) -> Grounding:
         SceneError: Neither one of the two words nor a positive capacitance up to 1 mF.
     """
     fix = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
-    if isinstance(grounding, str) and grounding in get_args(_Tie):
-        return cast("_Tie", grounding)
-    farads = math.nan if isinstance(grounding, str | bool) else as_float(grounding)
+    if isinstance(grounding, str):
+        if grounding in get_args(_Tie):
+            return cast("_Tie", grounding)
+        close = nearest(grounding, get_args(_Tie))
+        hint = f"did you mean {close!r}? " if close else ""
+        raise SceneError(f"grounding is {shorten(grounding)}, which is not known; {hint}{fix}")
+    farads = math.nan if isinstance(grounding, bool) else as_float(grounding)
     if not 0 < farads < math.inf:
-        raise SceneError(f"grounding is {grounding!r}, not a positive finite capacitance; {fix}")
+        raise SceneError(
+            f"grounding is {shorten(grounding)}, not a positive finite capacitance; {fix}"
+        )
     if farads > _LARGEST:
         raise SceneError(
-            f"grounding is {farads:g} farads, more than anything has; 100 pF are 100e-12, and a "
-            'body of a large capacitance to ground is "grounded"'
+            f"grounding is {farads:g} F, more than {_LARGEST:g} F; the capacitance to ground is in "
+            f'farads; did you mean {farads * 1e-12:g}? A body of a large one is "grounded"'
         )
     return farads

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_number, shorten
 from capsense.errors import SceneError
-from capsense.scene.materials import Grounding, Material, checked_grounding
-from capsense.scene.materials import material as find_material
+from capsense.scene.materials import Grounding, Material, checked_grounding, checked_material
 from capsense.scene.mesh_shape import SHEET_THICKNESS, RestSurface, SurfaceMesh
 from capsense.scene.pose import Pose, checked_pose
 from capsense.scene.shapes import Shape
@@ -69,7 +68,7 @@ class Body:
         fields = self.__dict__
         fields["shape"] = shape
         fields["pose"] = checked_pose(pose)
-        fields["material"] = material if isinstance(material, Material) else find_material(material)
+        fields["material"] = checked_material(material)
         fields["grounding"] = checked_grounding(grounding)
         fields["name"] = name
         fields["force"] = checked_force(force)
@@ -144,7 +143,7 @@ class DeformableSurface:
     ) -> None:
         self._rest = RestSurface(vertices, faces, thickness)
         self._shape = SurfaceMesh(self._rest.vertices, self._rest)
-        self.material = material if isinstance(material, Material) else find_material(material)
+        self.material = checked_material(material)
         self.grounding = checked_grounding(grounding)
         self.name = name
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ProtocolError, require_package
-from capsense.server import (
+from capsense.server.binary import (
     PROTOCOL,
     DepthMessage,
     ReadingMessage,

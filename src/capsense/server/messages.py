@@ -30,7 +30,7 @@ from capsense.scenario import (
 from capsense.scene import Body, DepthFrame, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.materials import Grounding
-from capsense.server import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
+from capsense.server.binary import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
 
 MAX_TEXT = 65536
 """Largest control message [bytes]."""
@@ -186,13 +186,13 @@ def read_open(table: MessageTable) -> Open:
         CapSenseError: A camera, material or grounding is wrong.
     """
     table.only(("type", "sensor", "design", "camera", "material", "grounding", "back", "touch"))
-    options = ScenarioTable({"material": "steel", **table.data}, "message", "open")
+    options = ScenarioTable(table.data, "message", "open")
     back: Literal["fill"] | float = "fill"
     if table.data.get("back", "fill") != "fill":
         back = table.length("back")
     camera = _read_camera(MessageTable(table.data.get("camera", {}), "message", "camera"))
     return Open(
-        _sensor(table), table.text("design"), camera, read_material(options),
+        _sensor(table), table.text("design"), camera, read_material(options, "steel"),
         read_grounding(options), back, table.boolean("touch", False), table.data,
     )  # fmt: skip
 

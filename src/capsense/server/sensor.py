@@ -16,7 +16,7 @@ from capsense.reading import Reading
 from capsense.readout import Readout
 from capsense.readout.conversions import Counts
 from capsense.scene import Body, Scene
-from capsense.server import (
+from capsense.server.binary import (
     CONVERSION,
     NO_DETECTOR,
     DepthMessage,

@@ -1,54 +1,25 @@
-"""One client of the server: its connection, which bounds what it can do, and its messages."""
+"""One client of the server: its messages, its sensors, and what they read."""
 
 from __future__ import annotations
 
 import asyncio
 import json
-import socket
-import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, Protocol, TypeVar
 
 from capsense.codec import design_to_json
-from capsense.errors import CapSenseError, MissingDependencyError, ProtocolError
-from capsense.server import PROTOCOL, messages, unpack_depth
-from capsense.server.messages import BodiesMessage, PosesMessage
+from capsense.errors import CapSenseError, ProtocolError
+from capsense.server import messages
+from capsense.server.binary import PROTOCOL, unpack_depth
+from capsense.server.connection import POLICY, Allowance, ConnectionClosed, ServerConnection
+from capsense.server.messages import BodiesMessage, Open, PosesMessage, Watch
+from capsense.server.options import ServerOptions
 from capsense.server.sensor import Frame, ServedSensor
 
-try:
-    from websockets.asyncio.server import ServerConnection, serve
-    from websockets.datastructures import Headers
-    from websockets.exceptions import ConnectionClosed
-    from websockets.frames import Frame as WebSocketFrame
-    from websockets.frames import Opcode
-    from websockets.http11 import Request, Response
-except ImportError as error:
-    raise MissingDependencyError(
-        'the server needs websockets; install it with: pip install "capsense[serve]"'
-    ) from error
+T = TypeVar("T")
 
-if TYPE_CHECKING:
-    from capsense.server.server import Server
-
-__all__ = ["Headers", "Request", "Response", "ServerConnection", "serve"]  # for the server
-
-POLICY, TRY_LATER = 1008, 1013
-"""Codes with which connections are closed on errors, and when there are too many."""
-FLOOD = "flood"
-"""Reason with which a client that talks idly is cut off."""
-READ_SIZE = 16384
-"""Bytes that are read at a time: then it is the others' turn."""
-SEND_BUFFER = 262144
-"""What the system may hold for a client that does not receive [bytes]."""
-SMALL = 1024
-"""Size [bytes] from which on a fragment of a message counts as content."""
-ARRIVALS = 100.0
-"""Connections that a server takes at once, and again every second; others are closed."""
-IDLE_FRAMES = 100.0
-"""Pings, pongs and small fragments that a client may send at once, and again every second."""
 ALLOWANCE, ALL_ALLOWANCES = 5000.0, 10000.0
 """Work that a client, and that all of them, may cause a second without being slowed, in units of a
 small message, which takes the event loop some 50 µs."""
@@ -60,102 +31,37 @@ OPENING, MISTAKE = 250.0, 100.0
 """What it takes to open a sensor, and to answer an error."""
 
 
-class Allowance:
-    """A token bucket that can be overdrawn.
+class Host(Protocol):
+    """What a session needs of the server that runs it."""
 
-    Args:
-        most: What can be spent at once, after a rest.
-        rate: What comes back a second.
-        first: What can be spent at the start; by default ``most``.
-    """
+    version: str
 
-    def __init__(self, most: float, rate: float, first: float | None = None) -> None:
-        self.most, self.rate = most, rate
-        self._left = most if first is None else first
-        self._counted = time.monotonic()
+    @property
+    def options(self) -> ServerOptions:
+        """What is served, and to whom."""
 
-    def spend(self, cost: float) -> float:
-        """Spend some, and return what is left: below zero, more was spent than there was."""
-        now = time.monotonic()
-        regained = (now - self._counted) * self.rate
-        self._counted = now
-        self._left = min(self.most, self._left + regained) - cost
-        return self._left
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
 
+    @property
+    def design_names(self) -> tuple[str, ...]:
+        """Names of the designs, the default first."""
 
-@dataclass
-class AdmissionControl:
-    """Connections of a server, those that still shake hands included."""
+    def make_sensor(self, wanted: Open) -> ServedSensor:
+        """A sensor for a client."""
 
-    most: int
-    """More are closed at once."""
-    open: int = 0
-    arrivals: Allowance = field(default_factory=lambda: Allowance(ARRIVALS, ARRIVALS))
+    def find(self, wanted: Watch) -> tuple[int, ServedSensor]:
+        """A sensor that is to be watched, and the number of its client."""
 
-    def admits(self) -> bool:
-        """Whether the connection that was just made may stay."""
-        if self.open > self.most:
-            return False
-        if self.arrivals.spend(1) < 0:
-            self.arrivals.spend(-1)  # those that are turned away keep nobody out
-            return False
-        return True
+    async def work(self, job: Callable[[], T]) -> T:
+        """Do a job in a worker thread."""
 
+    def log(self, event: str, **fields: Any) -> None:
+        """Log an event."""
 
-class RateLimitedConnection(ServerConnection, asyncio.BufferedProtocol):
-    """A connection that reads a little at a time, and is cut off when its client talks idly.
-
-    Whole messages are paced by their session. Pings, pongs and fragments of a message that never
-    ends do not get that far, yet would keep the event loop busy and fill the memory.
-    """
-
-    def __init__(self, *args: Any, admission: AdmissionControl, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.flooded = False
-        """Whether it was cut off."""
-        self._admission = admission
-        self._buffer = bytearray(READ_SIZE)
-        self._idle_frames = Allowance(IDLE_FRAMES, IDLE_FRAMES)
-
-    # -- called by asyncio ------------------------------------------------------------------------
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._admission.open += 1
-        super().connection_made(transport)
-        raw = transport.get_extra_info("socket")
-        if raw is not None:
-            raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        if not self._admission.admits():
-            cast(asyncio.Transport, transport).abort()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._admission.open -= 1
-        super().connection_lost(exc)
-
-    def get_buffer(self, sizehint: int) -> bytearray:
-        return self._buffer
-
-    def buffer_updated(self, nbytes: int) -> None:
-        self.data_received(bytes(memoryview(self._buffer)[:nbytes]))
-
-    # -- called by websockets ---------------------------------------------------------------------
-
-    def process_event(self, event: Any) -> None:
-        if self.flooded:
-            return
-        if isinstance(event, WebSocketFrame) and _idle(event) and self._idle_frames.spend(1) < 0:
-            self.flooded = True
-            self.protocol.fail(POLICY, FLOOD)
-            for data in filter(None, self.protocol.data_to_send()):
-                self.transport.write(data)
-            self.transport.close()
-            return
-        super().process_event(event)
-
-
-def _idle(frame: WebSocketFrame) -> bool:
-    """Whether a frame is none that sessions hear of; what ends a message is."""
-    return frame.opcode in (Opcode.PING, Opcode.PONG) or (not frame.fin and len(frame.data) < SMALL)
+    def fault(self, event: str, **fields: Any) -> None:
+        """Log the exception at hand."""
 
 
 class ClientSession:
@@ -171,7 +77,7 @@ class ClientSession:
         server: Runs it.
     """
 
-    def __init__(self, number: int, connection: ServerConnection, server: Server) -> None:
+    def __init__(self, number: int, connection: ServerConnection, server: Host) -> None:
         self.number = number
         self.sensors: dict[int, ServedSensor] = {}
         self.readings = 0

@@ -10,9 +10,9 @@ from operator import is_
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.cover import Touch
 from capsense.design.film import Film
 from capsense.field.green_kernels import Green
+from capsense.reading import Touch
 from capsense.scene import Scene
 from capsense.scene.geometry_kernels import Boxes
 from capsense.scene.scene import PackedScene

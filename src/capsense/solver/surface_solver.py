@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.constants import UNIT
 from capsense.design.model import Design
 from capsense.errors import CapSenseError, SceneError, SolveError
-from capsense.field.background import CapacitanceChange, Charges
 from capsense.field.face import sheet_on_face
 from capsense.field.face_kernels import WALL_FADE_LENGTH
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
 from capsense.field.green_points import narrowest_width
 from capsense.field.panels import PLANE_TOL
+from capsense.reading import CapacitanceChange, Charges
 from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import TOUCH, Sheets
 from capsense.scene.geometry_kernels import overlapping
@@ -39,7 +40,7 @@ from capsense.solver.system.step import (
     solve_each,
 )
 from capsense.solver.tree.dynamic_surface import DynamicBody
-from capsense.solver.tree.matter import UNIT, Matter, matter_of, sizes_of
+from capsense.solver.tree.matter import Matter, matter_of, sizes_of
 from capsense.solver.tree.rigid import BODY, RigidShape
 from capsense.solver.tree.shape_cache import functions_of
 

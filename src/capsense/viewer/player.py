@@ -6,17 +6,15 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import CapSenseError
 from capsense.scenario.model import read_channels
+from capsense.viewer.plane import Plane
 from capsense.viewer.source import Frame, Seekable, Source, Stream
-
-if TYPE_CHECKING:
-    from capsense.viewer.charts import Plane
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 from capsense._style import signal_colours
 from capsense.design import Design
 from capsense.design.geometry import Surface
-from capsense.field.background import Charges
 from capsense.plotting.designs import ROLE_COLOURS
+from capsense.reading import Charges
 from capsense.scene import Body, Layers, Pose, Scene, Shape, ShapeKind
-from capsense.viewer.charts import Plane
+from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
     from viser import ViserServer

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from capsense.codec import design_from_json
 from capsense.errors import ProtocolError, RecordingError, ServerError
-from capsense.field.background import Charges
-from capsense.reading import Reading, StepStats
+from capsense.reading import Charges, Reading, StepStats
 from capsense.recording import GONE, reading_of
 from capsense.scenario import Channel, Scenario
 from capsense.scenario.model import Excitation, channels_of
@@ -24,10 +23,10 @@ from capsense.server import DepthMessage, ReadingMessage
 from capsense.server.client import Client
 from capsense.server.messages import MessageTable, Open, read_open, read_scene
 from capsense.simulator import Simulator
+from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
     from capsense.recording.reader import Recording
-    from capsense.viewer.charts import Plane
 
 
 Array = NDArray[np.float64]

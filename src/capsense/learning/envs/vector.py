@@ -18,8 +18,8 @@ from capsense.adapters.rules import Rules
 from capsense.adapters.world import Solid
 from capsense.errors import SceneError
 from capsense.fleet import Fleet
-from capsense.learning.envs import ApproachStop, Dressing, LimbFollow
 from capsense.learning.envs.base import CapacitiveEnv
+from capsense.learning.envs.tasks import ApproachStop, Dressing, LimbFollow
 from capsense.reading import Reading, StepStats
 from capsense.scene import Body, Pose, Shape
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.cover import Cover, Touch, Viscosity
+from capsense.cover import Cover, Viscosity
 from capsense.design.geometry import Surface
+from capsense.reading import Touch
 from capsense.scene.scene import Body
 from capsense.solver.gap.touch_kernels import (
     contact_force,

@@ -36,7 +36,7 @@ WALL_PENALTY = 1e5
 """Energy of charge that is out of reach [1/m]."""
 LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
-_WIDE = 4.0
+WIDE_CLUSTER = 4.0
 """Sides of a cluster, over its distance from a flat design, from which on its images are bounded:
 four points are good to 0.1 % of their mean up to there."""
 
@@ -154,7 +154,7 @@ def bound_images(leaves, rows, pairs, green):
             image[q, 0], image[q, 1] = points[j, q, 0], points[j, q, 1]
             image[q, 2] = 2.0 * green.floor - points[j, q, 2]
         side = math.sqrt(12.0 * arm(points[j][0], points[j][1]) * arm(points[j][0], points[j][2]))
-        if inverse * side < _WIDE or lowest < 0.0:
+        if inverse * side < WIDE_CLUSTER or lowest < 0.0:
             continue
         met = mean_inverse(points[j], image, 0.0)
         for k in range(green.phi_columns, rows.shape[1]):

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.constants import EPS0
+from capsense.constants import UNIT
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
 from capsense.scene.geometry_kernels import parted
 from capsense.scene.materials import Grounding, Material
@@ -23,8 +23,6 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Ints = NDArray[np.int64]
 
-UNIT = 4 * math.pi * EPS0
-"""Capacitance of a ball of one metre [F]; the kernels take it for one."""
 CONDUCTING = 1e4
 """Magnitude of the complex permittivity from which the inside of a body holds no field."""
 _BOUND = 300.0, 3000.0

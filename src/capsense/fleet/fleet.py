@@ -1,0 +1,503 @@
+"""Sensors of one design in many environments."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense._thread_pool import ForkSafeRLock
+from capsense._validate import as_whole, checked_frequency, shorten
+from capsense.design import load_design
+from capsense.design.model import Design
+from capsense.errors import MissingDependencyError, ReadoutError, SceneError
+from capsense.field.background import Terminals
+from capsense.field.cache import default_settings, load_or_build
+from capsense.fleet.bodies import (
+    WORLD,
+    BodyTable,
+    checked_forces,
+    checked_poses,
+    on_device,
+    require_no_gradient,
+)
+from capsense.fleet.check import FleetCheck, by_simulator, summary
+from capsense.fleet.cpu import CpuCore
+from capsense.reading import FleetReading, Reading, StepStats
+from capsense.readout import Readout
+from capsense.readout.config import make_readout
+from capsense.readout.side_by_side import SideBySide
+from capsense.scene import Body
+from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator, checked_preset
+from capsense.solver.surface_solver import PRESETS, SurfaceSolver
+from capsense.solver.tree.fine_panels import WIDE
+
+if TYPE_CHECKING:
+    from capsense.fleet.warp_chips import WarpChips
+    from capsense.fleet.warp_core import WarpCore
+
+Array = NDArray[np.float64]
+
+_PANELS = 5
+"""Panels of a shape for each cluster that a body is cut into on Warp."""
+
+
+class Fleet:
+    """Sensors of one design in many environments, with the same places for bodies in each.
+
+    What stands in a place may differ from environment to environment, and change at a reset: see
+    :meth:`change`. Bodies out of a sensor's sight cost nothing on the CPU.
+
+    On the CPU, readings are those of :meth:`Simulator.step` of the same preset; but bodies that
+    touch each other are not joined to one conductor. On Warp every body is cut into as many
+    clusters as ``budget`` says, in single precision: the fewer, the faster and the less exact, see
+    :meth:`check`.
+
+    Args:
+        design: A design, its name, or the path of its file.
+        bodies: What stands in every environment, one body for each place; their poses are not used.
+            Rigid shapes.
+        count: How many environments, e.
+        sensors: How many sensors of the design each has, s.
+        device: ``"cpu"`` for the compiled core on all processors, or a device of Warp:
+            ``"cuda:0"``, or ``"warp:cpu"``, which is for tests.
+        preset: Accuracy on the CPU, as of :class:`Simulator`.
+        budget: Clusters of each body on Warp: 32, 64 or 128.
+        excitation_frequency: Excitation frequency [Hz].
+
+    Raises:
+        DesignError: The design is wrong.
+        SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have.
+        ValueError: There is no such preset, budget or device, or the frequency or a count is not
+            positive.
+        MissingDependencyError: Warp is asked for and not installed.
+    """
+
+    def __init__(
+        self,
+        design: Design | str | Path,
+        bodies: Sequence[Body],
+        count: int,
+        *,
+        sensors: int = 1,
+        device: str = "cpu",
+        preset: PresetName = DEFAULT_PRESET,
+        budget: int = 64,
+        excitation_frequency: float = 250e3,
+    ) -> None:
+        for what, number in (("count", count), ("sensors", sensors)):
+            if (as_whole(number) or 0) < 1:
+                raise ValueError(f"{what} is {number!r}; give a whole number from 1")
+        count, sensors = int(count), int(sensors)
+        self.excitation_frequency = checked_frequency(excitation_frequency)
+        given, bodies = bodies, list(bodies) if isinstance(bodies, Iterable) else []
+        if not bodies or not all(isinstance(body, Body) for body in bodies):
+            raise SceneError(f"bodies is {shorten(given)}; give a list of at least one Body")
+        preset = checked_preset(preset)
+        if budget not in (32, 64, 128):
+            raise ValueError(f"budget is {shorten(budget)}; choose one of 32, 64, 128")
+        self.design = design if isinstance(design, Design) else load_design(design)
+        self.count, self.sensors, self.places = count, sensors, len(bodies)
+        """How many environments, sensors in each, and places for bodies."""
+        self.device = device
+        field = load_or_build(self.design, default_settings(self.design))
+        chosen_preset = PRESETS[preset]
+        finer: dict[PresetName, PresetName] = {"fast": "standard", "standard": "fine"}
+        self.finer = finer.get(preset) if device == "cpu" else "fine"
+        if device != "cpu":
+            chosen_preset = replace(
+                chosen_preset, panels=_PANELS * budget, coarsest=None, finest=None
+            )
+        self._solver = SurfaceSolver(
+            field.green, self.design, excitation_frequency=self.excitation_frequency,
+            preset=chosen_preset,
+        )  # fmt: skip
+        self._terminals = Terminals(self.design, field.capacitance)
+        n = self._terminals.electrodes
+        self.baseline: Array = self._terminals.empty[:n, :n].copy()
+        """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
+        self.table = BodyTable(self._solver, count, len(bodies), sensors)
+        self.readout: Readout | None = None
+        """The readout of which every sensor has a chip, if any."""
+        self._chips: Any = None
+        self._one, self._warned = ForkSafeRLock(), False
+        self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
+        self._warp = None if device == "cpu" else self._on_warp(budget)
+        for place, body in enumerate(bodies):
+            self.change(place, body)
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._warp is not None:
+            raise TypeError(
+                f"a fleet on {self.device!r} cannot be pickled or copied: its arrays are those of "
+                "one process and device; make another with cs.Fleet(…) where it is needed"
+            )
+        return vars(self)
+
+    def _on_warp(self, budget: int) -> WarpCore:
+        try:
+            from capsense.fleet.warp_core import WarpCore, known_device
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"device {self.device!r} needs Warp; install it with: pip install 'capsense[warp]'"
+            ) from error
+        return WarpCore(
+            self._solver, self._terminals, (self.count, self.places, self.sensors), budget,
+            known_device(self.device),
+        )  # fmt: skip
+
+    @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Electrode names in matrix order."""
+        return self.design.electrode_names
+
+    def change(
+        self,
+        place: int,
+        bodies: Body | Sequence[Body | None] | None,
+        environments: ArrayLike | None = None,
+    ) -> None:
+        """Change what stands in a place: shape, size, material, grounding, or nothing at all.
+
+        Sizes of one proportion share what is worked out of a shape; a capsule or box of new
+        proportions takes some ten milliseconds.
+
+        Args:
+            place: Number of the place.
+            bodies: A body or None for all, or one for each of the environments.
+            environments: Which environments, shape (k,); all by default.
+
+        Raises:
+            SceneError: There is no such place or environment, the numbers do not match, or a body
+                is of a shape that is not rigid, or no conductor in a place that is joined.
+        """
+        with self._one:
+            self.table.change(place, bodies, environments)
+            self._take_over()
+        if self._warp is not None and not self._warned:
+            self._warn_of_wide(place)
+
+    def _warn_of_wide(self, place: int) -> None:
+        for body in {id(b): b for b in self.table.given[:, place] if b is not None}.values():
+            middle = float(np.sort(np.ptp(body.shape.bounds(), axis=0))[1])
+            if middle > WIDE:
+                self._warned = True
+                warnings.warn(
+                    f"place {place}: {middle:.2g} m is wide for a body on Warp, which is cut into "
+                    "few clusters: near the sensor readings are tens of per cent off. Compare with "
+                    'fleet.check(poses), or take device="cpu". Further warnings are suppressed',
+                    stacklevel=3,
+                )
+                return
+
+    def hide(self, sensor: int, places: Sequence[int]) -> None:
+        """Leave places out of what a sensor sees, such as the link that carries it.
+
+        Args:
+            sensor: Number of the sensor.
+            places: Numbers of the places; the sensor sees all others.
+
+        Raises:
+            SceneError: There is no such sensor or place.
+        """
+        self.table.hide(sensor, places)
+        self._take_over()
+
+    def join(self, places: Sequence[int]) -> None:
+        """Make the conductors in some places one, in all environments, as if a wire joined them.
+
+        A fleet does not look for contact. Conductors that are joined share their net charge, and
+        are tied to ground by the sum of their capacitances; with one that is grounded all are.
+        Members out of a sensor's sight, hidden ones too, count for what ties the others to ground.
+
+        Args:
+            places: Numbers of the places; what they are joined with already joins in.
+
+        Raises:
+            SceneError: There is no such place, or something else than a conductor stands there.
+        """
+        self.table.join(places)
+        self._take_over()
+
+    def _take_over(self) -> None:
+        if self._warp is not None:
+            shapes = cast("list[Any]", self.table.shapes)
+            self._warp.take(self.table.bodies, shapes, self.table.forces)
+
+    @property
+    def empty(self) -> Reading:
+        """The reading of a sensor in an empty environment, which no chip has seen."""
+        total, n = self._terminals.empty, self._terminals.electrodes
+        coupling = total[:n, n:].sum(axis=1)
+        nothing = np.zeros_like(self.baseline)
+        stats = StepStats(0.0, 0.0)
+        return Reading(self.baseline.copy(), nothing, stats, self.electrode_names, coupling)
+
+    def use_readout(
+        self,
+        readout: Readout | str | Path | None,
+        *,
+        start: float | None = None,
+        seed: int | None = None,
+    ) -> None:
+        """Read every sensor through a chip of its own from now on.
+
+        All are switched on together; noise differs from chip to chip.
+
+        Args:
+            readout: A readout for this design's electrodes, which stays as it is, the name of a
+                chip with its usual settings, the path of a readout file (``.toml``), or None.
+            start: Time at which they are switched on [s], by default 0; always 0 on Warp.
+            seed: Of all random numbers, by default the readout's own.
+
+        Raises:
+            ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
+                number from 0 on; the readout is of other electrodes; or it has open electrodes or
+                parts of the user's own, or is not switched on at 0 s, and the fleet is on Warp.
+        """
+        self.readout = self._chips = None
+        if readout is None:
+            return
+        chip = copy.deepcopy(make_readout(readout, self))
+        if chip.bank.electrodes != self.electrode_names:
+            raise ReadoutError(
+                f"the readout is of electrodes {chip.bank.electrodes}, the fleet of "
+                f"{self.electrode_names}"
+            )
+        self._switch_on(chip, start, seed)
+
+    def reset(self, *, start: float | None = None, seed: int | None = None) -> None:
+        """Restart the chips; a fleet keeps nothing else from step to step.
+
+        Args:
+            start: Time at which they are switched on [s], by default 0; always 0 on Warp.
+            seed: Of all random numbers from now on; by default they repeat.
+
+        Raises:
+            ReadoutError: The seed is no whole number from 0 on, or chips on Warp are not switched
+                on at 0 s.
+        """
+        if self.readout is not None:
+            self._switch_on(self.readout, start, seed)
+
+    def _switch_on(self, chip: Readout, start: float | None, seed: int | None) -> None:
+        """Make chips of one kind, switched on at a time [s]."""
+        begun = 0.0 if start is None else start
+        chip.reset(start=begun, seed=seed)
+        with self._one:
+            chips: SideBySide | WarpChips
+            if self._warp is None:
+                chips = SideBySide(chip, self.count * self.sensors, seed=chip.seed)
+                chips.reset(start=begun)
+            elif begun != 0.0:
+                raise ReadoutError(
+                    f"start is {begun:g} s, but chips on Warp are switched on at 0 s; leave it out "
+                    "and let the fleet's time begin at 0"
+                )
+            else:
+                chips = self._warp.chips(chip, self.baseline, chip.seed)
+            self.readout, self._chips = chip, chips
+
+    def step(
+        self,
+        poses: ArrayLike,
+        sensors: ArrayLike | None = None,
+        *,
+        forces: ArrayLike | None = None,
+        time: Any = None,
+        jacobian: bool = False,
+    ) -> FleetReading:
+        """Return the readings of all environments.
+
+        On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph. On the
+        CPU, arrays of others are copied.
+
+        Args:
+            poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
+                shape (e, b, 7).
+            sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
+                frame is the world's.
+            forces: Normal forces that press bodies onto the design's cover [N], NaN for none,
+                where their overlap counts, shape (e, b); by default those of the bodies themselves.
+                The cover is elastic, without relaxation and hysteresis.
+            time: Time of the scenes [s], not before that of the last step; a readout needs it. On
+                Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
+                graphs.
+            jacobian: Whether to work out ``reading.jacobian`` as well.
+
+        Raises:
+            SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long;
+                there are forces and no cover, or a Jacobian is asked for with forces.
+            SolveError: Some environments have no solution; the message names the first.
+            ReadoutError: A readout is given no time, or time went back.
+        """
+        if self._chips is not None and time is None:
+            raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
+        with self._one:
+            reading = self.solved(poses, sensors, forces=forces, jacobian=jacobian)
+            if self._chips is None:
+                return reading
+            matrix = reading.delta
+            if self._warp is None:
+                matrix = reading.capacitance
+                time = np.asarray(time).item() if hasattr(time, "__dlpack__") else time
+            return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
+
+    def _forces(self, forces: ArrayLike | None, jacobian: bool) -> Any:
+        """Forces on the bodies [N], shape (e, b); those on a device of Warp are not looked at.
+
+        Raises:
+            SceneError: They are wrong, or cannot be taken into account.
+        """
+        shape, out = (self.count, self.places), forces
+        if self._warp is None or forces is None or not on_device(forces):
+            out = self.table.forces if forces is None else checked_forces(forces, shape)
+            if np.isnan(out).all():
+                return out
+        else:
+            require_no_gradient("forces", forces)
+        if self.design.cover is None:
+            if forces is None:  # as a simulator does
+                return np.full(shape, np.nan)
+            raise SceneError(
+                f"forces press bodies onto a cover, which design {self.design.name!r} does not "
+                "have; add a [[cover]] to it, or leave them out"
+            )
+        if jacobian:
+            raise SceneError(
+                "a Jacobian is asked for of bodies that forces hold, which fleets do not have; "
+                "leave the forces out, or take a Simulator"
+            )
+        return out
+
+    def solved(
+        self, poses: ArrayLike, sensors: ArrayLike | None = None, *,
+        forces: ArrayLike | None = None, jacobian: bool = False,
+    ) -> FleetReading:  # fmt: skip
+        """As :meth:`step`, without chips and their time."""
+        if jacobian and self.table.lossy:
+            raise SceneError(
+                "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
+                "them a conductor's or a lossless material"
+            )
+        shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
+        held = self._forces(forces, jacobian)
+        if self._warp is None:
+            if sensors is None:
+                sensors = np.broadcast_to(WORLD, shapes[1])
+            return self._cpu.step(
+                checked_poses("poses", poses, shapes[0]),
+                checked_poses("sensors", sensors, shapes[1]),
+                held,
+                jacobian,
+            )
+        for name, each in (("poses", poses), ("sensors", sensors)):
+            require_no_gradient(name, each)
+        where, at = (
+            each if each is None or on_device(each) else checked_poses(name, each, shape)
+            for name, each, shape in zip(
+                ("poses", "sensors"), (poses, sensors), shapes, strict=True
+            )
+        )
+        core = self._warp
+        core.solve(where, at, None if forces is None else held)
+        return FleetReading(
+            core.capacitance, core.delta, self.electrode_names, core.error,
+            shield_coupling=core.shields,
+            conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
+            touch=core.touch,
+        )  # fmt: skip
+
+    def check(
+        self,
+        poses: ArrayLike,
+        sensors: ArrayLike | None = None,
+        *,
+        samples: int = 16,
+        seed: int = 0,
+    ) -> FleetCheck:
+        """Compare some environments with a ``Simulator`` of a finer preset.
+
+        That is ``"fine"``; of a fleet on the CPU with the preset ``"fast"``, ``"standard"``. A
+        simulator joins the conductors that touch each other, and no others. If places are joined,
+        the comparison is with a finer fleet on the CPU, where the same places are. On Warp, the
+        arrays of the last reading are written anew.
+
+        Args:
+            poses: As :meth:`step` takes them, on the host.
+            sensors: The same of the sensors.
+            samples: How many environments, drawn at random; all, where there are no more.
+            seed: Of the draw.
+
+        Raises:
+            SceneError: As by :meth:`step`.
+            ValueError: The fleet has the preset ``"fine"``, and there is no finer one; or
+                ``samples`` is not a whole number from 1.
+            SolveError: As by :meth:`step`.
+        """
+        if self.finer is None:
+            raise ValueError(
+                'the fleet has preset "fine", and there is no finer one to check it against; '
+                'make one with preset="standard"'
+            )
+        whole = as_whole(samples)
+        if whole is None or whole < 1:
+            raise ValueError(f"samples is {shorten(samples)}; give a whole number from 1")
+        e, s = self.count, self.sensors
+        where = checked_poses("poses", poses, (e, self.places, 7))
+        at = np.broadcast_to(WORLD, (e, s, 7))
+        if sensors is not None:
+            at = checked_poses("sensors", sensors, (e, s, 7))
+        delta = self.solved(where, at).delta
+        found = delta if isinstance(delta, np.ndarray) else delta.numpy()
+        rows = np.random.default_rng(seed).permutation(e)[:whole]
+        group = self.table.bodies.group
+        if len(np.unique(group)) < len(group):
+            reading = self._finer_fleet(self.finer, rows).solved(where[rows], at[rows])
+            truth = reading.delta
+            contact = reading.error >= np.abs(reading.capacitance).max(axis=(2, 3))
+        else:
+            simulator = Simulator(
+                self.design, excitation_frequency=self.excitation_frequency, preset=self.finer
+            )
+            truth, contact = by_simulator(simulator, self.table, rows, where[rows], at[rows])
+        return summary(found[rows], truth, contact, rows, self.lifted(where, at, rows))
+
+    def _finer_fleet(self, preset: PresetName, rows: NDArray[np.int64]) -> Fleet:
+        """Some environments as a fleet on the CPU, whose places are joined alike."""
+        given, known = self.table.given[rows], self.table.bodies
+        some: Body = next(body for body in self.table.given.ravel() if body is not None)
+        finer = Fleet(
+            self.design, [some] * self.places, len(rows), sensors=self.sensors, preset=preset,
+            excitation_frequency=self.excitation_frequency,
+        )  # fmt: skip
+        for place in range(self.places):
+            finer.change(place, given[:, place].tolist())
+        for sensor, hidden in enumerate(known.hidden):
+            finer.hide(sensor, np.flatnonzero(hidden).tolist())
+        for number in np.unique(known.group):
+            places = np.flatnonzero(known.group == number).tolist()
+            if len(places) > 1:
+                finer.join(places)
+        return finer
+
+    def lifted(self, poses: Array, sensors: Array, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which sensors of some environments lack the first millimetres, see :class:`FleetCheck`.
+
+        Args:
+            poses: As :meth:`step` takes them, on the host.
+            sensors: As ``poses``.
+            rows: Numbers of the environments, shape (k,).
+
+        Returns:
+            Shape (k, s).
+        """
+        nodes = None if self._warp is None else self._warp.gap.slots
+        return self._cpu.lifted(poses, sensors, rows, nodes)
