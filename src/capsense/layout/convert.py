@@ -364,11 +364,11 @@ def _slabs(
         slabs.append((slab.name, slab.eps_r, low, high))
     slabs.sort(key=lambda s: s[2])
     merged: list[tuple[str, float, float, float]] = []
-    for slab in slabs:
-        if merged and merged[-1][1] == slab[1] and abs(merged[-1][3] - slab[2]) < GRID:
-            merged[-1] = ("board", slab[1], merged[-1][2], slab[3])
+    for row_ in slabs:
+        if merged and merged[-1][1] == row_[1] and abs(merged[-1][3] - row_[2]) < GRID:
+            merged[-1] = ("board", row_[1], merged[-1][2], row_[3])
         else:
-            merged.append(slab)
+            merged.append(row_)
     rows = [_layer(*slab, board, origin) for slab in merged]
     if mask and merged:
         for name, z0, sign in (("mask below", merged[0][2], -1), ("mask", merged[-1][3], 1)):

@@ -42,7 +42,7 @@ def read(path: Path, error: float, thickness: float) -> BoardLayout:
                     archive.extractall(spare)
                 where = Path(spare)
             whole, notes = _thickness(where, thickness)
-            files = sorted((role, f) for f in where.rglob("*") if (role := _role(f)) is not None)
+            files = sorted((r, f) for f in where.rglob("*") if (r := _role(f)) is not None)
             for (_, role), file in files:
                 layer = _opened(file, role)
                 if role == "drill":

@@ -244,8 +244,8 @@ class _BoardReader:
         if kind == "curve":
             return LineString(bezier(self.points(child(item, "pts")), self.error)), None
         if kind == "circle" and end and ends["center"]:
-            x, y = ends["center"]
-            area = self.disc((x, -y), math.dist((x, -y), end))
+            cx, cy = ends["center"]
+            area = self.disc((cx, -cy), math.dist((cx, -cy), end))
         elif kind == "rect" and start and end:
             area = MultiPoint([start, end]).envelope
         elif kind == "poly":
