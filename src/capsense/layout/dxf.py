@@ -37,6 +37,7 @@ def read(path: Path, error: float, thickness: float) -> BoardLayout:
     scale = _UNITS.get(int(drawing.header.get("$INSUNITS", 4)), 1.0)
     areas: dict[str, list[BaseGeometry]] = {}
     lines: dict[str, list[BaseGeometry]] = {}
+    item: Any
     for item in recursive_decompose(drawing.modelspace()):
         if item.dxftype() not in _KINDS:
             continue

@@ -146,9 +146,9 @@ class _BoardReader:
                 self.pieces.append((self.net(item), layer, dot))
         for item in children(board, "zone"):
             self.zone(item, lambda p: p)
-        for item in board:
-            if isinstance(item, list) and str(item[0]).startswith("gr_"):
-                self.graphic(item, lambda p: p, self.net(item))
+        for part in board:
+            if isinstance(part, list) and str(part[0]).startswith("gr_"):
+                self.graphic(part, lambda p: p, self.net(part))
         for item in children(board, "footprint", "module"):
             self.footprint(item)
 
