@@ -11,6 +11,7 @@ from capsense.errors import (
     DesignError,
     ExperimentalWarning,
     FieldError,
+    LayoutError,
     MeshError,
     MissingDependencyError,
     PartialError,
@@ -24,6 +25,8 @@ from capsense.errors import (
     SolveError,
 )
 from capsense.fleet import Fleet, FleetReading
+from capsense.layout import load_layout
+from capsense.layout.model import BoardLayout
 from capsense.plotting import plot
 from capsense.reading import Reading, StepStats
 from capsense.readout import Readout
@@ -50,15 +53,17 @@ from capsense.viewer import show
 __version__: str
 
 __all__ = [
-    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "Body", "Box", "CapSenseError",
+    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "BoardLayout", "Body", "Box",
+    "CapSenseError",
     "Capsule", "Client", "Counts", "Cylinder", "DeformableSurface", "DepthFrame", "Design",
     "DesignError", "Ellipsoid", "ExperimentalWarning", "FieldError", "Fleet", "FleetReading",
-    "Layers", "Material", "MeshError", "MissingDependencyError", "OrthographicCamera",
-    "PartialError", "PerspectiveCamera", "Pose", "ProtocolError", "Reading", "Readout",
-    "ReadoutError", "Recorder", "RecordingError", "Scenario", "ScenarioError", "Scene",
+    "Layers", "LayoutError", "Material", "MeshError", "MissingDependencyError",
+    "OrthographicCamera", "PartialError", "PerspectiveCamera", "Pose", "ProtocolError", "Reading",
+    "Readout", "ReadoutError", "Recorder", "RecordingError", "Scenario", "ScenarioError", "Scene",
     "SceneError", "ServerError", "Simulator", "Skin", "SkinError", "SolveError", "Sphere",
     "StepStats", "TriMesh", "__version__", "assistive_gym", "available_chips", "available_designs",
     "calibrate", "coppeliasim", "decode_permittivity", "encode_permittivity", "humans",
-    "load_design", "load_readout", "load_scenario", "mujoco", "open_recording", "plot",
-    "point_surface", "pybullet", "record", "render_depth", "replay", "show", "skin",
+    "load_design", "load_layout", "load_readout", "load_scenario", "mujoco", "open_recording",
+    "plot", "point_surface", "pybullet", "record", "render_depth", "replay", "show",
+    "skin",
 ]  # fmt: skip

@@ -21,6 +21,7 @@ from capsense.cli import (
     OK,
     Interrupt,
     design,
+    layout,
     recordings,
     run,
     say,
@@ -31,7 +32,8 @@ from capsense.cli import (
 from capsense.errors import CapSenseError, FieldError, SolveError
 
 COMMANDS = (
-    run.run, run.record, recordings.replay, recordings.export, design.design, recordings.readout,
+    run.run, run.record, recordings.replay, recordings.export, design.design, layout.layout,
+    recordings.readout,
     studies.dataset, studies.optimise, studies.bench, studies.reproduce, serve.serve, serve.view,
     warmup.warmup,
 )  # fmt: skip

@@ -50,6 +50,10 @@ class DesignError(CapSenseError, ValueError):
     """A sensor design is wrong; the message names the item, the value and the fix."""
 
 
+class LayoutError(CapSenseError, ValueError):
+    """A layout of a board cannot be read, or makes no design."""
+
+
 class SceneError(CapSenseError, ValueError):
     """A scene, body, shape, pose or material is wrong."""
 

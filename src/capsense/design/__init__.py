@@ -33,7 +33,15 @@ from capsense.design.geometry import (
     read_placement,
 )
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role, check_design
-from capsense.design.shapes import SHAPES, box_surface, cylinder_surface, planar_surface
+from capsense.design.shapes import (
+    SHAPES,
+    box_surface,
+    cylinder_surface,
+    planar_surface,
+    polygon,
+    polygons_surface,
+    prism_facets,
+)
 from capsense.errors import DesignError
 
 LAYER_EPS_R: dict[str, float] = {
@@ -220,7 +228,7 @@ def _read_surface(
     table: DesignTable, folder: Path, domain: Domain, extra: tuple[str, ...]
 ) -> Surface:
     """Read ``shape``, where it sits, and its own keys; ``extra`` are keys of the item itself."""
-    shape = table.choice("shape", [*SHAPES, *SOLIDS, "stl"])
+    shape = table.choice("shape", [*SHAPES, "polygons", *SOLIDS, "stl"])
     common = ("name", "shape", *extra, *PLACEMENT_KEYS)
     if shape == "stl":
         from capsense.design.stl_shape import read_stl_surface
@@ -229,6 +237,9 @@ def _read_surface(
         return read_stl_surface(table, folder, domain)
     if shape in SOLIDS:
         return _read_solid(table, shape, common)
+    if shape == "polygons":
+        table.only((*common, "polygons"))
+        return polygons_surface(table, read_placement(table))
     table.only((*common, *SHAPES[shape].keys, "leads"))
     return planar_surface(table, shape, read_placement(table))
 
@@ -277,7 +288,11 @@ def _read_layer(table: DesignTable, folder: Path) -> Layer:
 def _read_part(table: DesignTable, folder: Path) -> tuple[Facet, ...]:
     """The faces of a dielectric part with a ``shape``, normals outwards."""
     common = (*LAYER_KEYS, "shape", *PLACEMENT_KEYS)
-    shape = table.choice("shape", (*SOLIDS, "stl"))
+    shape = table.choice("shape", (*SOLIDS, "polygon", "stl"))
+    if shape == "polygon":
+        table.only((*LAYER_KEYS, "shape", "points", "holes", "z"))
+        (outline,) = polygon(table)
+        return prism_facets(outline, *table.interval("z"))
     if shape == "stl":
         from capsense.design.stl_shape import read_stl_solid
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -106,6 +107,56 @@ def polygon(table: DesignTable) -> list[Polygon]:
             f"points enclose an area of {shape.area:g} m²; give corners that enclose an area"
         )
     return [orient(shape)]
+
+
+def polygons_surface(table: DesignTable, placement: Placement) -> Surface:
+    """``polygons``: a list of outlines, each with ``points``, optional ``holes`` and ``z`` [m].
+
+    They are one conductor, on one level or on several.
+
+    Raises:
+        DesignError: There is none, or one of them is wrong, or two on one level overlap.
+    """
+    rows = table.tables("polygons")
+    if not rows:
+        raise table.error("polygons is empty; give a list of { points = [[x, y], …] }")
+    levels: dict[float, list[Polygon]] = {}
+    for number, raw in enumerate(rows):
+        item = DesignTable(raw, table.source, f"{table.item}: polygons[{number}]", table.limit)
+        item.only(("points", "holes", "z"))
+        levels.setdefault(item.coordinate("z", 0.0), []).extend(polygon(item))
+    facets, rims = [], []
+    for z, outlines in levels.items():
+        tree = shapely.STRtree(outlines)
+        for one, other in tree.query(outlines, predicate="intersects").T:
+            if one < other and outlines[one].intersection(outlines[other]).area > 0.0:
+                raise table.error(
+                    f"polygons {one} and {other} at z = {z:g} overlap (numbers count those of one "
+                    "z, from 0); unite them"
+                )
+        level = Placement(placement.apply(np.array([0.0, 0.0, z])), placement.rotation)
+        sheet = place_polygons(outlines, level)
+        facets += sheet.facets
+        rims.append(sheet.rims)
+    return Surface(tuple(facets), np.concatenate(rims))
+
+
+def prism_facets(outline: Polygon, low: float, high: float) -> tuple[Facet, ...]:
+    """Faces of an upright prism between two heights [m], normals outwards."""
+    outline = orient(outline)
+    down = np.diag([1.0, -1.0, -1.0])
+    mirrored = orient(shapely.affinity.scale(outline, 1.0, -1.0, origin=(0, 0)))
+    facets = [
+        Facet(outline, np.array([0.0, 0.0, high]), np.eye(3)),
+        Facet(mirrored, np.array([0.0, 0.0, low]), down),
+    ]
+    for ring in (outline.exterior, *outline.interiors):
+        corners = np.asarray(ring.coords)
+        for start, end in pairwise(corners):
+            along = (end - start) / (width := float(np.hypot(*(end - start))))
+            axes = np.array([[*along, 0.0], [0.0, 0.0, 1.0], [along[1], -along[0], 0.0]])
+            facets.append(Facet(box(0.0, 0.0, width, high - low), np.array([*start, low]), axes))
+    return tuple(facets)
 
 
 def disc(table: DesignTable) -> list[Polygon]:
