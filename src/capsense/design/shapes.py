@@ -125,7 +125,8 @@ def polygons_surface(table: DesignTable, placement: Placement) -> Surface:
         item = DesignTable(raw, table.source, f"{table.item}: polygons[{number}]", table.limit)
         item.only(("points", "holes", "z"))
         levels.setdefault(item.coordinate("z", 0.0), []).extend(polygon(item))
-    facets, rims = [], []
+    facets: list[Facet] = []
+    rims = []
     for z, outlines in levels.items():
         tree = shapely.STRtree(outlines)
         for one, other in tree.query(outlines, predicate="intersects").T:
