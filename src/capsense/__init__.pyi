@@ -26,7 +26,7 @@ from capsense.errors import (
 )
 from capsense.fleet import Fleet, FleetReading
 from capsense.layout import load_layout
-from capsense.layout.model import BoardLayout
+from capsense.layout.board import BoardLayout
 from capsense.plotting import plot
 from capsense.reading import Reading, StepStats
 from capsense.readout import Readout

@@ -11,8 +11,8 @@ from capsense.cli import OK, PICTURES, arg, check_picture, command, facts, group
 from capsense.errors import LayoutError
 
 if TYPE_CHECKING:
+    from capsense.layout.board import BoardLayout
     from capsense.layout.convert import BoardDesign
-    from capsense.layout.model import BoardLayout
 
 
 def _millimetres(text: str) -> float:

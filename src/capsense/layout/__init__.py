@@ -12,7 +12,7 @@ from pathlib import Path
 
 from capsense._validate import as_number
 from capsense.errors import LayoutError
-from capsense.layout.model import BoardLayout
+from capsense.layout.board import BoardLayout
 
 READERS = {
     ".kicad_pcb": "kicad",

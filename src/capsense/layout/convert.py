@@ -20,7 +20,7 @@ from capsense.design import LAYER_EPS_R, parse_design
 from capsense.design.model import Design
 from capsense.errors import LayoutError
 from capsense.field.boundary import build_model
-from capsense.layout.model import BoardLayout, polygons_of
+from capsense.layout.model import BoardData, polygons_of
 
 GRID = 1e-6
 """Coordinates are whole multiples of this [m]."""
@@ -56,7 +56,7 @@ class NetFigures(NamedTuple):
 class BoardDesign:
     """A design made of a layout, and how it was made."""
 
-    layout: BoardLayout
+    layout: BoardData
     design: Design
     content: Mapping[str, Any]
     """What the design's file holds."""
@@ -110,7 +110,7 @@ def build_cost(panels: int) -> tuple[float, float]:
 
 
 def convert(
-    layout: BoardLayout,
+    layout: BoardData,
     electrodes: Sequence[str],
     roles: Mapping[str, Sequence[str]],
     *,
@@ -180,7 +180,7 @@ def convert(
 
 
 def _assigned(
-    layout: BoardLayout, electrodes: Sequence[str], roles: Mapping[str, Sequence[str]]
+    layout: BoardData, electrodes: Sequence[str], roles: Mapping[str, Sequence[str]]
 ) -> dict[str, str]:
     """Role of each net that is taken, electrodes first."""
     out: dict[str, str] = {}
@@ -214,7 +214,7 @@ class _Frame(NamedTuple):
 
 
 def _placed(
-    layout: BoardLayout, assigned: Mapping[str, str], side: str, layers: Sequence[str]
+    layout: BoardData, assigned: Mapping[str, str], side: str, layers: Sequence[str]
 ) -> tuple[Copper, _Frame]:
     """The nets that are taken, the sensor's side up."""
     frame = _Frame(side == "bottom", min(layout.heights.values()))
@@ -235,7 +235,7 @@ def _placed(
     return out, frame
 
 
-def _board(layout: BoardLayout, placed: Copper) -> tuple[Polygon, list[str]]:
+def _board(layout: BoardData, placed: Copper) -> tuple[Polygon, list[str]]:
     """The outline of the board, simplified, in the axes of ``placed``."""
     everything = [v for levels in placed.values() for v in levels.values()]
     copper = shapely.union_all(everything)
@@ -354,7 +354,7 @@ def _sheet(
 
 
 def _slabs(
-    layout: BoardLayout, board: Polygon, frame: _Frame, origin: tuple[float, float], top: float,
+    layout: BoardData, board: Polygon, frame: _Frame, origin: tuple[float, float], top: float,
     mask: bool,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Tables of the dielectrics, from the bottom up; neighbours of one permittivity are one."""

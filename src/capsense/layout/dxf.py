@@ -9,8 +9,8 @@ from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from capsense.errors import LayoutError, require_package
+from capsense.layout.board import BoardLayout
 from capsense.layout.curves import even_odd, outline_of, quarter_segments
-from capsense.layout.model import BoardLayout
 from capsense.layout.stl import OUTLINES, level_layout
 
 _UNITS = {1: 25.4, 2: 304.8, 4: 1.0, 5: 10.0, 6: 1000.0, 13: 1e-3}

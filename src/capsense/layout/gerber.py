@@ -17,9 +17,10 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from capsense.errors import LayoutError, require_package
+from capsense.layout.board import BoardLayout
 from capsense.layout.curves import outline_of, quarter_segments
 from capsense.layout.kicad import FR4
-from capsense.layout.model import BoardLayout, Slab, gather, in_metres, polygons_of, united
+from capsense.layout.model import Slab, gather, in_metres, polygons_of, united
 
 
 def read(path: Path, error: float, thickness: float) -> BoardLayout:

@@ -20,8 +20,9 @@ from shapely.geometry.base import BaseGeometry
 
 from capsense._validate import read_file
 from capsense.errors import LayoutError
+from capsense.layout.board import BoardLayout
 from capsense.layout.curves import arc_through, bezier, outline_of, quarter_segments
-from capsense.layout.model import UNCONNECTED, BoardLayout, Slab, gather, in_metres, united
+from capsense.layout.model import UNCONNECTED, Slab, gather, in_metres, united
 
 Node = list["str | Node"]
 XY = tuple[float, float]

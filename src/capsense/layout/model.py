@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any
 
 import shapely
 import shapely.affinity
@@ -14,9 +14,6 @@ from shapely.geometry.base import BaseGeometry
 
 from capsense._validate import suggest
 from capsense.errors import LayoutError
-
-if TYPE_CHECKING:
-    from capsense.layout.convert import BoardDesign
 
 UNCONNECTED = "(no net)"
 """Name of the copper that belongs to no net."""
@@ -34,7 +31,7 @@ class Slab:
 
 
 @dataclass(frozen=True, eq=False)
-class BoardLayout:
+class BoardData:
     """Copper of a board by net and layer, and what is around it.
 
     Lengths in metres, in the axes of the board: x and y as its file has them, y up; z = 0 at the
@@ -78,34 +75,6 @@ class BoardLayout:
             found.update(dict.fromkeys(sorted(names, key=natural)))
         return list(found)
 
-    def assign(
-        self,
-        electrodes: Sequence[str],
-        *,
-        shield: Sequence[str] = (),
-        ground: Sequence[str] = (),
-        floating: Sequence[str] = (),
-        **options: Any,
-    ) -> BoardDesign:
-        """Make a design of some nets; the others are left out.
-
-        Args:
-            electrodes: Names or patterns of the nets that are electrodes, in matrix order.
-            shield: Those that are driven with the transmitter.
-            ground: Those at ground.
-            floating: Those that are connected to nothing.
-            options: As :func:`capsense.layout.convert.convert` takes them.
-
-        Raises:
-            LayoutError: A pattern matches no net, a net has two roles, or two nets touch.
-            DesignError: What comes out is no design that can be built.
-        """
-        from capsense.layout.convert import convert
-
-        return convert(
-            self, electrodes, {"shield": shield, "ground": ground, "floating": floating}, **options
-        )
-
 
 def _matches(name: str, pattern: str) -> bool:
     plain = name.rpartition("/")[2]
@@ -114,8 +83,6 @@ def _matches(name: str, pattern: str) -> bool:
 
 def natural(name: str) -> list[tuple[int, str]]:
     """A key that sorts TOUCH2 before TOUCH10."""
-    import re
-
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 

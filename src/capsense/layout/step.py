@@ -9,8 +9,8 @@ from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from capsense.errors import LayoutError
+from capsense.layout.board import BoardLayout
 from capsense.layout.curves import even_odd
-from capsense.layout.model import BoardLayout
 from capsense.layout.stl import OUTLINES, level_layout
 
 LEVEL = 1e-3

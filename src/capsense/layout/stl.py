@@ -10,7 +10,8 @@ from shapely.geometry.base import BaseGeometry
 
 from capsense.design.stl import read_stl
 from capsense.errors import LayoutError
-from capsense.layout.model import BoardLayout, gather, in_metres, united
+from capsense.layout.board import BoardLayout
+from capsense.layout.model import gather, in_metres, united
 
 OUTLINES = ("outline", "board", "edge", "edge_cuts", "edge.cuts")
 """Names, in lower case, of what is the board and no net."""

@@ -11,9 +11,9 @@ from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from capsense.errors import LayoutError, require_package
+from capsense.layout.board import BoardLayout
 from capsense.layout.curves import even_odd, quarter_segments
 from capsense.layout.dxf import drawn_layout
-from capsense.layout.model import BoardLayout
 
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 
