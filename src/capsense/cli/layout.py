@@ -13,6 +13,7 @@ from capsense.errors import LayoutError
 if TYPE_CHECKING:
     from capsense.layout.board import BoardLayout
     from capsense.layout.convert import BoardDesign
+    from capsense.layout.model import BoardData
 
 
 def _millimetres(text: str) -> float:
@@ -125,7 +126,7 @@ def _listing(found: BoardLayout) -> str:
     ])  # fmt: skip
 
 
-def _facts(found: BoardLayout) -> list[tuple[str, str]]:
+def _facts(found: BoardData) -> list[tuple[str, str]]:
     levels = ", ".join(f"{k} at {z * 1e3:.4g} mm" for k, z in found.heights.items())
     slabs = ", ".join(
         f"{s.name} (εr {s.eps_r:g}, {(s.z[1] - s.z[0]) * 1e3:.4g} mm)" for s in found.slabs

@@ -21,6 +21,7 @@ from capsense.design.model import Design
 from capsense.errors import LayoutError
 from capsense.field.boundary import build_model
 from capsense.layout.model import BoardData, polygons_of
+from capsense.layout.writing import design_text
 
 GRID = 1e-6
 """Coordinates are whole multiples of this [m]."""
@@ -71,9 +72,16 @@ class BoardDesign:
 
     def toml(self) -> str:
         """The design as a file, with where it comes from in comments."""
-        from capsense.layout.writing import design_text
-
-        return design_text(self)
+        x, y = (1e3 * v for v in self.origin)
+        head = [
+            f"Made by `capsense layout` from {self.layout.source}.",
+            f"Outlines of copper are simplified to {self.tolerance * 1e3:.3g} mm; lengths are "
+            "metres.",
+            f"The origin is at x = {x:.4f}, y = {y:.4f} mm of the file (y up); "
+            f"the {self.side} side faces the world.",
+            *self.notes,
+        ]
+        return design_text(head, self.content, self.layout.nets)
 
     def save(self, path: str | Path) -> None:
         """Write the design to a ``.toml`` file."""

@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from capsense.layout.convert import BoardDesign
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 WIDTH = 100
 """Columns of a line."""
 
 
-def design_text(board: BoardDesign) -> str:
-    """A design file, with its source, tolerance and what was assumed in comments."""
-    x, y = (1e3 * v for v in board.origin)
-    head = [
-        f"Made by `capsense layout` from {board.layout.source}.",
-        f"Outlines of copper are simplified to {board.tolerance * 1e3:.3g} mm; lengths are metres.",
-        f"The origin is at x = {x:.4f}, y = {y:.4f} mm of the file (y up); "
-        f"the {board.side} side faces the world.",
-        *board.notes,
-    ]
+def design_text(
+    head: Sequence[str], content: Mapping[str, Any], layers: Mapping[str, Iterable[str]]
+) -> str:
+    """A design file: comments, the design's content, and the copper layers of each net."""
     lines = [f"# {line}" for line in head] + [""]
-    content = board.content
     lines += [f"{key} = {value_text(content[key])}" for key in ("name", "description")]
     lines += ["", "[domain]", *_keys(content["domain"])]
-    layers = {net: ", ".join(levels) for net, levels in board.layout.nets.items()}
     for key in ("electrode", "layer", "conductor"):
         for row in content.get(key, []):
-            remark = f"  # {layers[row['name']]}" if key != "layer" else ""
+            remark = f"  # {', '.join(layers[row['name']])}" if key != "layer" else ""
             lines += ["", f"[[{key}]]{remark}", *_keys(row)]
     return "\n".join(lines) + "\n"
 

@@ -244,7 +244,8 @@ def _region(name: str, mesh: LinkMesh, axes: Array, pad: Pad) -> tuple[Design, P
         raise SceneError(
             f"{name} does not unroll into one outline, since it folds over; paint smaller regions"
         )
-    outline = shapely.set_precision(outline.simplify(2 * _GRID), _GRID)
+    rounded = shapely.set_precision(outline.simplify(2 * _GRID), _GRID)
+    outline = max(shapely.get_parts(rounded), key=shapely.area)  # rounding cuts slivers off
     shape: dict[str, Any] = {"shape": "polygon", "points": _ring(outline.exterior)}
     if outline.interiors:
         shape["holes"] = [_ring(r) for r in outline.interiors]
