@@ -29,10 +29,7 @@ def main() -> None:
         scene = cs.Scene([cs.Body(finger, pose, "human", 100e-12)])
         for k in range(20):  # the chip converts one channel after another
             reading = sim.step(scene, time=number + 0.05 * k)
-        print(
-            f"{x * 1e3:6.1f}",
-            *(f"{reading.counts.latest()[name]:.0f}" for name in sim.electrode_names),
-        )
+        print(f"{x * 1e3:6.1f}", *reading.counts.held().code.tolist())
 
 
 if __name__ == "__main__":

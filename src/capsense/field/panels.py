@@ -66,6 +66,10 @@ def _joined(arrays: Sequence[Array]) -> Array:
     return out
 
 
+_MITRE = 5.5
+"""Corners of a buffer with mitred corners lie within so many times its width of the line."""
+
+
 def cut_facet(facet: Facet, rims: Array, grading: Grading, reach: float = 0.0) -> list[Polygon]:
     """Split a facet's polygon into graded pieces.
 
@@ -79,7 +83,8 @@ def cut_facet(facet: Facet, rims: Array, grading: Grading, reach: float = 0.0) -
     distance = grading.edge
     size = max(grading.smallest, grading.aspect * distance)
     while len(lines) and size < grading.largest and not rest.is_empty:
-        seen = lines[heights <= 8 * distance + 1e-6]
+        near = shapely.box(*facet.polygon.bounds).buffer(_MITRE * distance)
+        seen = lines[(heights <= 8 * distance + 1e-6) & shapely.intersects(near, lines)]
         if len(seen):
             merged = shapely.line_merge(shapely.union_all(seen))
             near = merged.buffer(distance, cap_style="square", join_style="mitre")
