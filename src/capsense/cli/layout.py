@@ -157,7 +157,7 @@ def _next(path: Path, found: BoardLayout) -> str:
 
 def _report(board: BoardDesign) -> str:
     """What the design holds of each net, and what building it takes."""
-    from capsense.layout.convert import build_cost
+    from capsense.field.boundary import build_cost
 
     rows, panels = board.figures()
     time, memory = build_cost(panels)

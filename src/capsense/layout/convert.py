@@ -112,15 +112,6 @@ def _sheet_rows(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [*content["electrode"], *content.get("conductor", [])]
 
 
-def build_cost(panels: int) -> tuple[float, float]:
-    """Estimated processor time [s] and memory [byte] of building a field of so many panels.
-
-    From builds of 5,262 panels (62 s, ``examples/layout/slider_counts.py``) and of 64 pads of 9,013
-    (3.2 GB), on two slow cores.
-    """
-    return 8.0 + 2e-6 * panels**2, 4e8 + 33.0 * panels**2
-
-
 def convert(
     layout: BoardData,
     electrodes: Sequence[str],

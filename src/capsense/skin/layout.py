@@ -15,6 +15,7 @@ from capsense._validate import as_number
 from capsense.design import parse_design
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
+from capsense.field.boundary import build_cost, build_model
 from capsense.scene import Pose, Scene
 from capsense.scene.contact import find_contacts, points_on
 
@@ -28,8 +29,8 @@ FLATTEST = 0.15
 """Electrodes on larger radii [m] are flat."""
 _SIGHT = 0.40
 """Side of the box in which a patch looks for bodies [m]."""
-_BUILD, _READ = 3.0, 1e-3
-"""About how long a field takes to build, and a patch that sees something to read [s]."""
+_READ = 5e-4
+"""About how long a patch that sees something takes to read [s] (``examples/painted_skin.py``)."""
 
 
 @dataclass(frozen=True)
@@ -127,9 +128,11 @@ class SkinLayout(Mapping[str, tuple[Design, Pose]]):
     def __repr__(self) -> str:
         designs = {id(d): d for d, _ in self.patches.values()}
         electrodes = sum(len(d.electrodes) for d, _ in self.patches.values())
+        panels = [build_model(design.in_units).panels.size for design in designs.values()]
+        seconds = sum(build_cost(count)[0] for count in panels)
         lines = [
             f"{len(self)} patches, {electrodes} electrodes, {len(designs)} distinct designs",
-            f"to build: about {_BUILD * len(designs):.0f} s, or nothing where fields are cached",
+            f"to build: about {seconds:.0f} s, or nothing where fields are cached",
             f"to read: at most about {1e3 * _READ * len(self):.0f} ms on one core, "
             "less where few patches see something",
         ]
