@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -46,3 +48,43 @@ def test_mujoco_sites() -> None:
         cs.mujoco.add_skin(spec, "fore", {})
     with pytest.raises(cs.SceneError, match="no body named 'forearm'"):
         cs.mujoco.add_skin(spec, "forearm", made)
+
+
+URDF = """
+<robot name="r"><link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"
+ ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="plate"/><origin xyz="0.1 0 0.2"
+ rpy="0.2 0 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="9" velocity="9"/></joint>
+<link name="plate"><inertial><origin xyz="0.02 -0.01 0.03" rpy="0.3 0.1 0"/><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>
+<box size="0.4 0.3 0.1"/></geometry></collision></link></robot>"""
+
+
+def test_pybullet_links(tmp_path: Path) -> None:
+    """Differential: a skin of the same layout that is given its scene and its poses by hand."""
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    link = trimesh.creation.box((0.4, 0.3, 0.1))
+    region = ((-0.12, -0.08, 0.04), (0.12, 0.08, 0.06))
+    made = cs.skin.from_mesh(link, count=2, region=region, patch=cs.load_design("six_patch"))
+    (tmp_path / "r.urdf").write_text(URDF)
+    client = p.connect(p.DIRECT)
+    try:
+        body = p.loadURDF(str(tmp_path / "r.urdf"), useFixedBase=True, physicsClientId=client)
+        p.resetJointState(body, 0, 0.3, physicsClientId=client)
+        place = p.getLinkState(body, 0, computeForwardKinematics=True, physicsClientId=client)[4:6]
+        fore = cs.Pose(*place)
+        above = fore @ next(iter(made.values()))[1] @ cs.Pose((0.01, 0.02, 0.06))
+        ball = cs.Pose(above.position)
+        shape = p.createCollisionShape(p.GEOM_SPHERE, radius=0.03, physicsClientId=client)
+        p.createMultiBody(0, shape, basePosition=ball.position, physicsClientId=client)
+        skin = cs.pybullet.attach_layout(client, body, "plate", made)
+        found = skin.read()
+        scene = cs.Scene([cs.Body(cs.Sphere(0.03), ball)])
+        wanted = cs.Skin(made).step(scene, made.poses(fore))
+        assert set(found) == set(wanted) == set(made)
+        largest = max(reading.delta.max() for reading in wanted.values())
+        assert largest > 2e-14
+        for name, reading in wanted.items():
+            np.testing.assert_allclose(found[name].delta, reading.delta, atol=1e-4 * largest)
+    finally:
+        p.disconnect(client)
