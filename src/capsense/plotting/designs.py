@@ -235,7 +235,7 @@ def _edge_on(
         points = ring_vertices(facet)[0]
         x, z = points[:, 0] * 1e3, points[:, 2]
         if np.ptp(z) < 1e-6:
-            for low, high in _runs(facet, float(points[:, 1].mean())):
+            for low, high in _runs(facet):
                 ax.plot(
                     [low, high], [height(z[0])] * 2, color=colour, lw=width, solid_capstyle="butt"
                 )
@@ -243,11 +243,11 @@ def _edge_on(
             ax.fill(x, [height(v) for v in z], color=colour, alpha=0.5, lw=upright)
 
 
-def _runs(facet: Any, y: float) -> list[tuple[float, float]]:
-    """Where a horizontal line at y [m] through a horizontal facet meets it: x [mm] from, to."""
+def _runs(facet: Any) -> list[tuple[float, float]]:
+    """Where a line along x through the centroid of a level facet meets it: x [mm] from, to."""
     rings = ring_vertices(facet)
     outline = Polygon(rings[0][:, :2], [r[:, :2] for r in rings[1:]])
-    x0, _, x1, _ = outline.bounds
+    (x0, _, x1, _), y = outline.bounds, outline.centroid.y
     cut = outline.intersection(shapely.geometry.LineString([(x0 - 1, y), (x1 + 1, y)]))
     parts = [p.bounds for p in shapely.get_parts(cut) if p.length > 0]
     return [(b[0] * 1e3, b[2] * 1e3) for b in parts]
