@@ -34,8 +34,8 @@ from capsense.errors import CapSenseError, FieldError, SolveError
 COMMANDS = (
     run.run, run.record, recordings.replay, recordings.export, design.design, layout.layout,
     recordings.readout,
-    studies.dataset, studies.optimise, studies.bench, studies.reproduce, serve.serve, serve.view,
-    warmup.warmup,
+    studies.dataset, studies.sweep, studies.optimise, studies.bench, studies.reproduce,
+    serve.serve, serve.view, warmup.warmup,
 )  # fmt: skip
 """The subcommands, in the order of ``--help``. A new one is a function that
 :func:`~capsense.cli.command` decorates, listed here."""

@@ -1,4 +1,4 @@
-"""``capsense dataset``, ``optimise``, ``bench`` and ``reproduce``: many steps at once."""
+"""``capsense dataset``, ``sweep``, ``optimise``, ``bench``, ``reproduce``: many steps at once."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from capsense.cli import (
+    EVERY,
     OK,
     QUIET,
     TARGET_MISSED,
@@ -20,6 +21,7 @@ from capsense.cli import (
     command,
     count_of,
     facts,
+    grouped,
     progress_shown,
     say,
     seconds,
@@ -31,6 +33,7 @@ from capsense.reproduce import STUDIES, load_study
 if TYPE_CHECKING:
     from capsense.learning.optimise import Bound, DesignTask
     from capsense.reproduce.harness import Study
+    from capsense.studies import Capacitances, Row
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -249,6 +252,131 @@ def _listed(names: list[str]) -> str:
     if len(names) <= shown:
         return ", ".join(names)
     return f"{', '.join(names[:shown])} and {len(names) - shown} more files"
+
+
+def _new_table(path: Path) -> None:
+    """Refuse before any computation what could not be written after it.
+
+    Raises:
+        ScenarioError: It is no name for a table.
+    """
+    if path.suffix.lower() != ".csv" or not path.parent.is_dir():
+        raise ScenarioError(
+            f"--output {path}: give a name that ends in .csv, in a folder that is there"
+        )
+
+
+_JOBS = arg("--jobs N", "processes (default: 1)", type=count_of, default=1)
+
+
+@command(
+    "sweep",
+    "capacitances of a design over a grid of its parameters",
+    arg("design DESIGN.toml", "a design whose file has expressions of parameters", type=Path),
+    arg(
+        "--vary NAME=VALUES",
+        "a parameter: FROM:TO:COUNT or A,B,C, with units mm, cm, m, in; give it once for each one",
+        action="append",
+        required=True,
+    ),
+    arg("-o --output TABLE.csv", "rows are appended as they finish", type=Path, required=True),
+    arg("--scenario FILE.toml", "bodies, as they stand at time 0", type=Path),
+    _JOBS,
+    QUIET,
+)
+def sweep(args: argparse.Namespace) -> int:
+    """Compute the capacitances of the empty domain for all combinations of the parameters, and what
+    the bodies of a scenario change. In DESIGN.toml, a text such as "=side / 2" is an expression.
+    What it will cost is said first. A point whose design cannot be made has an error in the table.
+
+    After an interruption, run the same command: what TABLE.csv holds is not computed again, and the
+    table is the same in the end. More values may be added in the same way.
+
+    examples:
+      capsense sweep pad.toml --vary side=10mm:30mm:5 -o pad.csv
+      capsense sweep pad.toml --vary side=10mm,20mm --vary gap=1mm:3mm:3 -o pad.csv --jobs 2
+      capsense sweep pad.toml --vary side=0.01,0.02 --scenario finger.toml -o pad.csv
+    """
+    from capsense.studies import Capacitances
+    from capsense.studies.sweeps import grid, load_template, parse_vary
+
+    _new_table(args.output)
+    vary: dict[str, list[float]] = {}
+    for text in args.vary:
+        name, values = parse_vary(text)
+        if name in vary:
+            raise ScenarioError(f"--vary {text}: {name} is given twice; list its values in one")
+        vary[name] = values
+    try:
+        points = grid(vary)
+    except ValueError as error:
+        raise ScenarioError(f"--vary: {error}") from None
+    template, folder = load_template(args.design)
+    evaluation = Capacitances.of(args.design.name, template, folder, points, args.scenario)
+    rows = _fill(args, points, evaluation)
+    if not args.quiet:
+        print(f"{len(rows)} rows in {args.output}{_without_results(rows)}")
+    return OK
+
+
+def _without_results(rows: list[Row]) -> str:
+    """How many rows have an error."""
+    wrong = sum(bool(row.error) for row in rows)
+    return f"; {wrong} without results, see column error" if wrong else ""
+
+
+def _fill(args: argparse.Namespace, points: list[Any], evaluation: Capacitances) -> list[Row]:
+    """Evaluate points into the table ``args.output``: the cost first, then progress."""
+    from capsense.studies.points import fill_table, missing
+    from capsense.studies.sweeps import cost_of
+
+    todo = missing(points, evaluation, args.output)
+    if todo and not args.quiet:
+        panels, each = cost_of(evaluation, todo)
+        done = len(points) - len(todo)
+        kept = f", {done} more are kept or cannot be made" if done else ""
+        say(f"{len(todo)} designs of about {grouped(panels)} panels{kept}: about "
+            f"{_duration(each * len(todo))} of a processor's time")  # fmt: skip
+    try:
+        with Progress(len(todo), "designs", quiet=args.quiet) as progress:
+            return fill_table(points, evaluation, args.output, jobs=args.jobs, each=progress)
+    except KeyboardInterrupt:
+        say(f"what was computed is kept in {args.output}; run it again to go on")
+        raise
+
+
+def _duration(value: float) -> str:
+    return f"{value:.0f} s" if value < 100 else (
+        f"{value / 60:.0f} min" if value < 6000 else f"{value / 3600:.1f} h"
+    )  # fmt: skip
+
+
+class Progress:
+    """Counts what is done: a bar on a terminal, else a line every :data:`EVERY` seconds."""
+
+    def __init__(self, total: int, unit: str, *, quiet: bool) -> None:
+        from tqdm import tqdm
+
+        self._total, self._unit, self._quiet = total, unit, quiet
+        self._count, self._told = 0, perf_counter()
+        self._bar = tqdm(
+            total=total, unit=f" {unit}", file=sys.stderr, disable=not progress_shown(quiet)
+        )
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, count: int) -> None:
+        """So many more are done."""
+        self._count += count
+        self._bar.update(count)
+        if self._quiet or not self._bar.disable or perf_counter() - self._told < EVERY:
+            return
+        self._told = perf_counter()
+        say(f"{self._count} of {self._total} {self._unit}")
 
 
 @command(

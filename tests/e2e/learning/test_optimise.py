@@ -16,8 +16,9 @@ import capsense as cs
 from capsense.__main__ import BAD_INPUT, OK, main
 from capsense.errors import DesignError, ScenarioError
 from capsense.learning import optimise
-from capsense.learning.optimise import Bound, DesignTask, evaluate, load_task, search, to_toml
+from capsense.learning.optimise import Bound, DesignTask, load_task, search, to_toml
 from capsense.learning.servo import LimbPose
+from capsense.studies.template import evaluate
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "designs" / "forearm_pads.toml"
 TASK = """
