@@ -100,15 +100,15 @@ def kept(path: Path, names: Sequence[str], outputs: Sequence[str]) -> dict[str, 
         )
     found: dict[str, _Found] = {}
     for number, line in enumerate(lines[1:], start=2):
-        *cells, error, key = line
         try:
             if len(line) != len(header):
                 raise ValueError
+            *cells, why, key = line
             results = tuple(math.nan if c == "" else float(c) for c in cells[len(names) :])
         except ValueError:
             raise ScenarioError(f"{path}: line {number} is damaged; remove it") from None
         if key:
-            found[key] = results, error
+            found[key] = results, why
     return found
 
 
