@@ -1,4 +1,4 @@
-"""``capsense dataset``, ``sweep``, ``optimise``, ``bench``, ``reproduce``: many steps at once."""
+"""``capsense dataset``, ``sweep``, ``optimise``, ``reproduce`` and others: many steps at once."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from capsense.cli import (
     TARGET_MISSED,
     BuildProgress,
     arg,
+    check_picture,
     command,
     count_of,
     facts,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from capsense.learning.optimise import Bound, DesignTask
     from capsense.reproduce.harness import Study
     from capsense.studies import Capacitances, Row
+    from capsense.studies.tolerances import Tolerances
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -319,6 +321,70 @@ def sweep(args: argparse.Namespace) -> int:
     return OK
 
 
+@command(
+    "tolerance",
+    "how capacitances scatter with a design's parameters, and the yield",
+    arg("study STUDY.toml", "a design, what scatters, and specifications", type=Path),
+    arg("-o --output TABLE.csv", "samples, appended as they finish", type=Path, required=True),
+    arg("--plot FILE", "tornado plot: .png, .svg or .pdf", type=Path),
+    _JOBS,
+    QUIET,
+)
+def tolerance(args: argparse.Namespace) -> int:
+    """Draw quasi-random samples of a design's parameters, compute their capacitances, and print for
+    each output its mean and standard deviation, the parameters in the order of their effects with
+    their first-order contributions to the variance, and the yield with its 95 % interval.
+
+    After an interruption, run the same command: what TABLE.csv holds is not computed again.
+
+    examples:
+      capsense tolerance study.toml -o samples.csv
+      capsense tolerance study.toml -o samples.csv --plot tornado.png --jobs 2
+    """
+    from capsense.studies.tolerances import analyse, load_study, tornado
+
+    _new_table(args.output)
+    if args.plot is not None:
+        check_picture("--plot", args.plot, ScenarioError)
+    study, evaluation = load_study(args.study)
+    rows = _fill(args, study.points, evaluation)
+    found = analyse(rows, evaluation.outputs, study.specifications)
+    if args.plot is not None:
+        tornado(found, list(study.specifications) or evaluation.outputs).savefig(args.plot)
+    if not args.quiet:
+        print(_tolerance_report(found))
+        print(f"\n{len(rows)} samples in {args.output}{_without_results(rows)}")
+    return OK
+
+
+def _tolerance_report(found: Tolerances) -> str:
+    """Scatter, ranking and yield as text; warns where the linear fit is poor."""
+    from capsense.studies.tolerances import POOR_FIT
+
+    lines = []
+    for name, output in found.outputs.items():
+        for number, (parameter, effect) in enumerate(output.effects.items()):
+            own = (name, f"{1e15 * output.mean:.4g}", f"{1e15 * output.deviation:.3g}")
+            share = 100 * output.contributions[parameter]
+            lines.append([
+                *(own if number == 0 else ("", "", "")), parameter, f"{1e15 * effect:+.3g}",
+                f"{share:.1f}",
+            ])  # fmt: skip
+        if output.explained < POOR_FIT:
+            say(f"warning: {name}: a linear fit explains {100 * output.explained:.0f} % of the "
+                "variance only, so that contributions are incomplete; see the samples")  # fmt: skip
+    header = ("output", "mean [fF]", "deviation [fF]", "parameter", "effect [fF]", "share [%]")
+    parts = [table(header, lines)]
+    if found.yields:
+        rows = [
+            (name, f"{100 * y.share:.1f}", f"{100 * y.low:.1f} to {100 * y.high:.1f}",
+             f"{y.passed} of {y.samples}")
+            for name, y in found.yields.items()
+        ]  # fmt: skip
+        parts.append(table(("specification", "yield [%]", "95 % interval", "passed"), rows))
+    return "\n\n".join(parts)
+
+
 def _without_results(rows: list[Row]) -> str:
     """How many rows have an error."""
     wrong = sum(bool(row.error) for row in rows)
@@ -403,7 +469,7 @@ def optimise(args: argparse.Namespace) -> int:
     """
     from dataclasses import replace
 
-    from capsense.learning.optimise import load_task, search, to_toml
+    from capsense.learning.optimise import at_bounds, load_task, search, to_toml
 
     if args.output.suffix.lower() != ".toml" or not args.output.parent.is_dir():
         raise ScenarioError(
@@ -427,6 +493,9 @@ def optimise(args: argparse.Namespace) -> int:
     found = task.content(values)
     head = f"# {task.name}: found by `capsense optimise {args.task.name}`, {count} candidates.\n"
     args.output.write_text(head + to_toml(found) + "\n", encoding="utf-8")
+    for name, (side, limit) in at_bounds(task, values).items():
+        say(f"warning: {name} ended at its {side} bound, {limit:g}; a better value may lie beyond: "
+            f"widen its range in {args.task}")  # fmt: skip
     if not args.quiet:
         rows = {"found": (values, coarse)}
         if not args.no_check:

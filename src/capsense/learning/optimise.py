@@ -183,6 +183,24 @@ def search(
     return min(tried, key=lambda pair: pair[1].cost)
 
 
+def at_bounds(task: DesignTask, values: Array) -> dict[str, tuple[str, float]]:
+    """Parameters that lie within a hundredth of their range of a bound.
+
+    Args:
+        task: What was to be found.
+        values: Of the parameters, shape (n,).
+
+    Returns:
+        Of each such parameter, ``"lower"`` or ``"upper"``, and the bound.
+    """
+    found = {}
+    for (name, span), value in zip(task.parameters.items(), values.tolist(), strict=True):
+        share = (value - span.low) / (span.high - span.low)
+        if not 0.01 < share < 0.99:
+            found[name] = ("lower", span.low) if share < 0.5 else ("upper", span.high)
+    return found
+
+
 def load_task(path: str | Path) -> DesignTask:
     """Load the file of a task; see ``docs/optimise.md``.
 

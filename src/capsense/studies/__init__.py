@@ -1,9 +1,10 @@
 """Studies of a design: what its capacitances do when its parameters change.
 
-:func:`sweep` goes over grids.
+:func:`sweep` goes over grids, :func:`tolerance` over samples of what scatters.
 """
 
 from capsense.studies.points import Evaluation, Row
 from capsense.studies.sweeps import Capacitances, sweep
+from capsense.studies.tolerances import load_study, tolerance
 
-__all__ = ["Capacitances", "Evaluation", "Row", "sweep"]
+__all__ = ["Capacitances", "Evaluation", "Row", "load_study", "sweep", "tolerance"]

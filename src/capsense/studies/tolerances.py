@@ -103,7 +103,7 @@ class Yield(NamedTuple):
     """How many samples pass."""
 
     passed: int
-    count: int
+    samples: int
     low: float
     """Lower end of the 95 % interval of the yield, after Wilson."""
     high: float
@@ -112,7 +112,7 @@ class Yield(NamedTuple):
     @property
     def share(self) -> float:
         """The yield."""
-        return self.passed / self.count
+        return self.passed / self.samples
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ def test_wilson() -> None:
     rows = [Row({"a": float(k)}, (float(k),), "touch" if k < 2 else "") for k in range(20)]
     found = analyse(rows, ["y"], {"y": Limits(-np.inf, 16.0)})
     one = found.yields["y"]
-    assert (one.passed, one.count, found.without_results) == (15, 20, 2)
+    assert (one.passed, one.samples, found.without_results) == (15, 20, 2)
     for end in (one.low, one.high):
         assert (end - 0.75) ** 2 == approx(1.959964**2 * end * (1 - end) / 20, rel=1e-5)
     with pytest.raises(ScenarioError, match="2 samples have results"):
