@@ -34,7 +34,7 @@ from capsense.reproduce import STUDIES, load_study
 if TYPE_CHECKING:
     from capsense.learning.optimise import Bound, DesignTask
     from capsense.reproduce.harness import Study
-    from capsense.studies import Capacitances, Row
+    from capsense.studies import Capacitances, StudyRow
     from capsense.studies.tolerances import Tolerances
 
 
@@ -385,13 +385,13 @@ def _tolerance_report(found: Tolerances) -> str:
     return "\n\n".join(parts)
 
 
-def _without_results(rows: list[Row]) -> str:
+def _without_results(rows: list[StudyRow]) -> str:
     """How many rows have an error."""
     wrong = sum(bool(row.error) for row in rows)
     return f"; {wrong} without results, see column error" if wrong else ""
 
 
-def _fill(args: argparse.Namespace, points: list[Any], evaluation: Capacitances) -> list[Row]:
+def _fill(args: argparse.Namespace, points: list[Any], evaluation: Capacitances) -> list[StudyRow]:
     """Evaluate points into the table ``args.output``: the cost first, then progress."""
     from capsense.studies.points import fill_table, missing
     from capsense.studies.sweeps import cost_of

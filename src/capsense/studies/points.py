@@ -49,7 +49,7 @@ class Evaluation(Protocol):
 
 
 @dataclass(frozen=True)
-class Row:
+class StudyRow:
     """One point of a table."""
 
     point: Point
@@ -143,7 +143,7 @@ def fill_table(
     *,
     jobs: int = 1,
     each: Callable[[int], object] = lambda count: None,
-) -> list[Row]:
+) -> list[StudyRow]:
     """Evaluate points and keep the results in a CSV file.
 
     Each result is appended as it finishes. Results that the file holds already are not computed
@@ -193,7 +193,7 @@ def fill_table(
             else:
                 key, results, error = "", nothing, _one_line(key_or_error)
             lines.append(line(key, point, results, error))
-            rows.append(Row(point, results, error))
+            rows.append(StudyRow(point, results, error))
         write_whole(path, table(lines))
     except OSError as error:
         if isinstance(error, ChildProcessError):

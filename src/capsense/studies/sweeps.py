@@ -22,7 +22,7 @@ from capsense.field.cache import cache_key, default_settings
 from capsense.scenario import load_scenario
 from capsense.scenario.model import Excitation, channels_of, read_channels
 from capsense.simulator import Simulator
-from capsense.studies.points import Evaluation, Point, Row, fill_table
+from capsense.studies.points import Evaluation, Point, StudyRow, fill_table
 from capsense.studies.template import fill, names_in
 
 MAX_POINTS = 100_000
@@ -145,7 +145,7 @@ def sweep(
     jobs: int = 1,
     each: Callable[[int], object] = lambda count: None,
     evaluation: Evaluation | None = None,
-) -> list[Row]:
+) -> list[StudyRow]:
     """Capacitances of a design over a grid of its parameters.
 
     Rows are appended to a CSV file as they finish. A sweep that was interrupted goes on where it

@@ -14,7 +14,7 @@ from scipy.stats import binomtest, norm, qmc, triang
 from capsense._validate import read_toml, suggest
 from capsense.errors import ScenarioError
 from capsense.scenario import ScenarioTable as Table
-from capsense.studies.points import Evaluation, Row, fill_table
+from capsense.studies.points import Evaluation, StudyRow, fill_table
 from capsense.studies.sweeps import Capacitances
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Distribution(NamedTuple):
         return np.asarray(triang.ppf(shares, (self.peak - self.first) / width, self.first, width))
 
 
-class Limits(NamedTuple):
+class Specification(NamedTuple):
     """What an output may be [F]."""
 
     least: float
@@ -66,7 +66,7 @@ class ToleranceStudy:
     """What scatters and what must hold; made by :func:`load_study`."""
 
     parameters: Mapping[str, Distribution]
-    specifications: Mapping[str, Limits]
+    specifications: Mapping[str, Specification]
     """Of outputs, by their names."""
     samples: int = 64
     """A power of two."""
@@ -147,7 +147,7 @@ def tolerance(
 
 
 def analyse(
-    rows: Sequence[Row], outputs: Sequence[str], specifications: Mapping[str, Limits]
+    rows: Sequence[StudyRow], outputs: Sequence[str], specifications: Mapping[str, Specification]
 ) -> Tolerances:
     """Scatter, contributions and yield of samples.
 
@@ -250,7 +250,7 @@ def _distribution(table: Table, name: str) -> Distribution:
     return Distribution(kind, low, high, peak)
 
 
-def _limits(table: Table, name: str) -> Limits:
+def _limits(table: Table, name: str) -> Specification:
     one = Table(table.data[name], table.source, f"specification {name!r}")
     one.only(("min", "max"))
     if not one.data:
@@ -259,7 +259,7 @@ def _limits(table: Table, name: str) -> Limits:
     most = one.number("max", -1.0, 1.0, np.inf, unit="F")
     if not least <= most:
         raise one.error(f"min = {least:g} is above max = {most:g}; exchange them")
-    return Limits(least, most)
+    return Specification(least, most)
 
 
 def tornado(found: Tolerances, outputs: Sequence[str]) -> Figure:

@@ -10,10 +10,10 @@ import pytest
 from approximate import approx
 
 from capsense.errors import DesignError, ScenarioError
-from capsense.studies.points import Row
+from capsense.studies.points import StudyRow
 from capsense.studies.tolerances import (
     Distribution,
-    Limits,
+    Specification,
     ToleranceStudy,
     analyse,
     load_study,
@@ -64,7 +64,9 @@ def test_distributions() -> None:
 
 def test_a_line(tmp_path: Path) -> None:
     """Of a linear function, effects, contributions and ranking are exact; so is the yield."""
-    study = ToleranceStudy(SCATTER, {"b": Limits(0.25, 0.5), "line": Limits(-9, 9)}, 1024)
+    study = ToleranceStudy(
+        SCATTER, {"b": Specification(0.25, 0.5), "line": Specification(-9, 9)}, 1024
+    )
     found = tolerance(study, Line(), tmp_path / "t.csv")
     line = found.outputs["line"]
     assert list(line.effects) == ["a", "b", "c"]
@@ -84,8 +86,8 @@ def test_a_line(tmp_path: Path) -> None:
 
 def test_wilson() -> None:
     """The interval solves (p - s)² = z² p (1 - p) / n; samples without results fail."""
-    rows = [Row({"a": float(k)}, (float(k),), "touch" if k < 2 else "") for k in range(20)]
-    found = analyse(rows, ["y"], {"y": Limits(-np.inf, 16.0)})
+    rows = [StudyRow({"a": float(k)}, (float(k),), "touch" if k < 2 else "") for k in range(20)]
+    found = analyse(rows, ["y"], {"y": Specification(-np.inf, 16.0)})
     one = found.yields["y"]
     assert (one.passed, one.samples, found.without_results) == (15, 20, 2)
     for end in (one.low, one.high):
@@ -96,9 +98,9 @@ def test_wilson() -> None:
 
 def test_a_parabola_is_no_line() -> None:
     """What a line does not explain is told."""
-    rows = [Row({"a": x}, (x * x,)) for x in np.linspace(-1, 1, 21).tolist()]
+    rows = [StudyRow({"a": x}, (x * x,)) for x in np.linspace(-1, 1, 21).tolist()]
     assert analyse(rows, ["y"], {}).outputs["y"].explained == approx(0.0, abs=1e-12)
-    flat = analyse([Row({"a": x}, (1.0,)) for x in (1.0, 2.0, 3.0)], ["y"], {}).outputs["y"]
+    flat = analyse([StudyRow({"a": x}, (1.0,)) for x in (1.0, 2.0, 3.0)], ["y"], {}).outputs["y"]
     assert (flat.explained, flat.contributions["a"]) == (1.0, 0.0)
 
 
@@ -107,7 +109,7 @@ def test_files(tmp_path: Path) -> None:
     file.write_text(STUDY)
     study, evaluation = load_study(file)
     assert study.parameters == {"side": Distribution("normal", 0.01, 0.0001)}
-    assert study.specifications == {"C0_E_E": Limits(1e-13, np.inf)}
+    assert study.specifications == {"C0_E_E": Specification(1e-13, np.inf)}
     assert len(study.points) == 8
     assert evaluation.outputs == ("C0_E_E",)
     for before, after, why in (
