@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -270,10 +270,22 @@ class Simulator:
             ValueError: A Jacobian or the field is asked for of a method that has none.
         """
         check_view("step takes", scene)
+        self._require(time)
+        with self._one:
+            return self.sampled(self._read(scene, time, jacobian, keep_field), time)
+
+    def _require(self, time: float | None) -> None:
         if self.readout is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(scene, time=…), in seconds")
+
+    def sampled(self, reading: Reading, time: float | None) -> Reading:
+        """A reading with what the :attr:`readout` makes of it at a time [s], if there is one.
+
+        Raises:
+            ReadoutError: It is given no time, or time went back.
+        """
+        self._require(time)
         with self._one:
-            reading = self._read(scene, time, jacobian, keep_field)
             if self.readout is None or time is None:
                 return reading
             return replace(reading, counts=self.readout.sample(time, reading))
@@ -445,21 +457,18 @@ class Simulator:
 
     def _each(self, scenes: Sequence[Scene | DepthFrame]) -> list[Reading | CapSenseError]:
         """Readings of scenes, each from rest, or what was wrong with them."""
-        start = perf_counter()
-        plain = [s.scene() if isinstance(s, DepthFrame) else s for s in scenes]
-        try:
-            solver = self._idle.popleft()
-        except IndexError:
-            solver = self.copy()._solver
-        try:
-            found = solver.solve_each(plain)
-        finally:
-            self._idle.append(solver)
-        seconds = (perf_counter() - start) / len(plain)
-        return [
-            f if isinstance(f, CapSenseError) else self._of(f, scene, seconds)
-            for f, scene in zip(found, plain, strict=True)
-        ]
+        return read_together([self] * len(scenes), scenes)
+
+    @property
+    def kind(self) -> Hashable:
+        """Simulators of one kind can be read in one call, see :func:`read_together`.
+
+        A cover remembers its contacts, and the method ``"fem_masked"`` its last step: such
+        simulators are each of a kind of their own.
+        """
+        if self.method != "surface" or self.design.cover is not None:
+            return id(self)
+        return id(self._background), self.preset, self.excitation_frequency
 
     def copy(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field.
@@ -507,6 +516,40 @@ class Simulator:
             "boundary panels": self.background.n_panels,
             "point charges": len(green.near_sources), "modes": green.n_modes,
         }  # fmt: skip
+
+
+def read_together(
+    simulators: Sequence[Simulator], scenes: Sequence[Scene | DepthFrame]
+) -> list[Reading | CapSenseError]:
+    """Readings of simulators of one kind without their readouts, or what was wrong with them.
+
+    They are those of :meth:`Simulator.solved` from rest, to the last bit; what they share is done
+    once.
+
+    Args:
+        simulators: Simulators of one :attr:`Simulator.kind`; one may come several times.
+        scenes: What each sees, in its frame.
+    """
+    start = perf_counter()
+    first, out = simulators[0], dict[int, Reading | CapSenseError]()
+    plain: dict[int, Scene] = {}
+    for k, scene in enumerate(scenes):
+        try:
+            plain[k] = scene.scene() if isinstance(scene, DepthFrame) else scene
+        except CapSenseError as error:
+            out[k] = error
+    try:
+        solver = first._idle.popleft()
+    except IndexError:
+        solver = first.copy()._solver
+    try:
+        found = solver.solve_each(list(plain.values()))
+    finally:
+        first._idle.append(solver)
+    seconds = (perf_counter() - start) / len(scenes)
+    for (k, scene), f in zip(plain.items(), found, strict=True):
+        out[k] = f if isinstance(f, CapSenseError) else simulators[k]._of(f, scene, seconds)
+    return [out[k] for k in range(len(scenes))]
 
 
 def checked_preset(preset: object) -> PresetName:

@@ -136,7 +136,7 @@ def test_a_failing_sensor_does_not_lose_the_others(
         raise SceneError("nothing to see")
 
     for name in ("middle", "right"):
-        monkeypatch.setattr(skin.simulators[name], "step", fail)
+        monkeypatch.setattr(skin.simulators[name], "sampled", fail)
     only = {name: view for name, view in views.items() if name != "right"}
     with pytest.raises(SkinError, match=r"1 of 3 sensors failed; 'middle': nothing") as caught:
         skin.step_views(only)

@@ -78,13 +78,28 @@ class AttachedSensor(ABC):
         """
         with self._one:
             world = self.view() if view is None else view
-            now = self._now_or_given(time)
+            now = self.time_of(time)
             reading = self.simulator.solved(world, time=now, keep_field=keep_field)
+            return self.sampled(reading, now)
+
+    def sampled(self, reading: Reading, time: float | None) -> Reading:
+        """A reading with what the :attr:`readout` makes of it, if there is one.
+
+        Args:
+            reading: Of the simulator's present state.
+            time: As of :meth:`read`.
+
+        Raises:
+            SceneError: The readout needs a time that the simulator does not tell.
+            ReadoutError: Time went back.
+        """
+        with self._one:
+            now = self.time_of(time)
             if self.readout is None or now is None:
                 return reading
             return replace(reading, counts=self.readout.sample(now, reading))
 
-    def _now_or_given(self, time: float | None) -> float | None:
+    def time_of(self, time: float | None) -> float | None:
         """The time of a reading [s]; None where nothing needs it that the simulator can tell.
 
         Raises:

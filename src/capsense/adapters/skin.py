@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -74,14 +74,17 @@ class AttachedSkin:
             SceneError: A pattern fits nothing any more, after bodies were added or removed.
         """
 
-        def task(sensor: GeometrySensor) -> Callable[[], Reading]:
-            return lambda: sensor.read(time, sensor.scene(links))
-
         with self._one:
             links = self._source.links()
             for sensor in self.sensors.values():
                 sensor.catch_up()
-            return read_all(self._pool, {name: task(s) for name, s in self.sensors.items()})
+            return read_all(
+                self._pool,
+                {name: sensor.simulator for name, sensor in self.sensors.items()},
+                lambda name: self.sensors[name].scene(links),
+                lambda name: self.sensors[name].time_of(time),
+                lambda name, reading: self.sensors[name].sampled(reading, time),
+            )
 
     def check(self) -> dict[str, list[str]]:
         """What is wrong with each sensor, by name; see :meth:`AttachedSensor.check`.

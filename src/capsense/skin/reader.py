@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 from capsense._thread_pool import ForkSafeRLock, ThreadPool, some_failed
 from capsense._validate import shorten, suggest
 from capsense.design.model import Design
-from capsense.errors import SceneError, SkinError
+from capsense.errors import CapSenseError, SceneError, SkinError
 from capsense.reading import Reading
 from capsense.readout import SEED_STRIDE, Readout
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Simulator, check_view
+from capsense.simulator import Simulator, check_view, read_together
 
 Array = NDArray[np.float64]
+_TOGETHER, _TURNS = 32, 3
+"""So many sensors are solved in one call at most; and so many calls there are for each thread, at
+least."""
 AnyDesign = Design | str | Path | Simulator
 
 
@@ -117,11 +120,10 @@ class Skin:
         self._check_names("views", views)
         for name, view in views.items():
             check_view(f"views[{name!r}]: step takes", view)
-        tasks = {
-            name: partial(self.simulators[name].step, view, time=time)
-            for name, view in views.items()
-        }
-        return read_all(self._pool, tasks)
+        return read_all(
+            self._pool, {name: self.simulators[name] for name in views}, views.__getitem__,
+            lambda _: time, lambda name, reading: self.simulators[name].sampled(reading, time),
+        )  # fmt: skip
 
     def use_readout(
         self,
@@ -244,13 +246,65 @@ def reset_all(sensors: Mapping[str, _WithChip], start: float | None, seed: int |
         sensor.reset(start=start, seed=own)
 
 
-def read_all(pool: ThreadPool, tasks: Mapping[str, Callable[[], Reading]]) -> dict[str, Reading]:
-    """Read sensors together: name → what reads it.
+def read_all(
+    pool: ThreadPool,
+    simulators: Mapping[str, Simulator],
+    view: Callable[[str], Scene | DepthFrame],
+    time: Callable[[str], float | None],
+    sampled: Callable[[str, Reading], Reading],
+) -> dict[str, Reading]:
+    """Read sensors together. Those of one kind are solved in one call for some of them at a time.
+
+    Args:
+        pool: The threads.
+        simulators: Name → simulator, each once.
+        view: What a sensor sees, in its frame.
+        time: When it does [s].
+        sampled: Adds what its chip makes of a reading.
 
     Raises:
         SkinError: Some of them failed; it holds the readings of the others.
     """
-    readings, failures = pool.run(tasks)
+    kinds: dict[Hashable, list[str]] = {}
+    for name, simulator in simulators.items():
+        kinds.setdefault(simulator.kind, []).append(name)
+    size = max(1, min(_TOGETHER, -(-len(simulators) // (_TURNS * pool.threads))))
+    parts = [names[k : k + size] for names in kinds.values() for k in range(0, len(names), size)]
+
+    def read(names: list[str]) -> dict[str, Reading | CapSenseError]:
+        out: dict[str, Reading | CapSenseError] = {}
+        seen: dict[str, Scene | DepthFrame] = {}
+        for name in names:
+            try:
+                seen[name] = view(name)
+                if len(names) == 1:
+                    out[name] = simulators[name].solved(seen[name], time=time(name))
+            except CapSenseError as error:
+                out[name] = error
+        if len(names) > 1 and seen:
+            found = read_together([simulators[name] for name in seen], list(seen.values()))
+            out |= zip(seen, found, strict=True)
+        for name in names:
+            reading = out[name]
+            if isinstance(reading, Reading):
+                try:
+                    out[name] = sampled(name, reading)
+                except CapSenseError as error:
+                    out[name] = error
+        return out
+
+    done, lost = pool.run({k: partial(read, names) for k, names in enumerate(parts)})
+    readings: dict[str, Reading] = {}
+    failures: dict[str, CapSenseError] = {}
+    for k, names in enumerate(parts):
+        for name in names:
+            result = lost[k] if k in lost else done[k][name]
+            if isinstance(result, Reading):
+                readings[name] = result
+            else:
+                failures[name] = result
+    readings = {name: readings[name] for name in simulators if name in readings}
+    failures = {name: failures[name] for name in simulators if name in failures}
     if failures:
-        raise SkinError(some_failed("sensors", failures, len(tasks)), readings, failures)
+        raise SkinError(some_failed("sensors", failures, len(simulators)), readings, failures)
     return readings
