@@ -34,11 +34,14 @@ from capsense.errors import CapSenseError, FieldError, SolveError
 COMMANDS = (
     run.run, run.record, recordings.replay, recordings.export, design.design, layout.layout,
     recordings.readout,
-    studies.dataset, studies.optimise, studies.bench, studies.reproduce, serve.serve, serve.view,
-    warmup.warmup,
+    studies.dataset, studies.sweep, studies.tolerance, studies.optimise, studies.bench,
+    studies.reproduce, serve.serve, serve.view, warmup.warmup,
 )  # fmt: skip
 """The subcommands, in the order of ``--help``. A new one is a function that
 :func:`~capsense.cli.command` decorates, listed here."""
+
+ALIASES = {"optimise": ["optimize"]}
+"""Other spellings of subcommands."""
 
 EXIT_CODES = """\
 exit codes:
@@ -80,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
         description, _, examples = cleandoc(command.execute.__doc__ or "").partition("examples:\n")
         sub = commands.add_parser(
             command.name,
+            aliases=ALIASES.get(command.name, []),
             help=command.help,
             description=description,
             epilog=f"examples:\n{examples}\n\n{EXIT_CODES}",

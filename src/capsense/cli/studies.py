@@ -1,4 +1,4 @@
-"""``capsense dataset``, ``optimise``, ``bench`` and ``reproduce``: many steps at once."""
+"""``capsense dataset``, ``sweep``, ``optimise``, ``reproduce`` and others: many steps at once."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from capsense.cli import (
+    EVERY,
     OK,
     QUIET,
     TARGET_MISSED,
     BuildProgress,
     arg,
+    check_picture,
     command,
     count_of,
     facts,
+    grouped,
     progress_shown,
     say,
     seconds,
@@ -31,6 +34,8 @@ from capsense.reproduce import STUDIES, load_study
 if TYPE_CHECKING:
     from capsense.learning.optimise import Bound, DesignTask
     from capsense.reproduce.harness import Study
+    from capsense.studies import Capacitances, StudyRow
+    from capsense.studies.tolerances import Tolerances
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -251,6 +256,195 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:shown])} and {len(names) - shown} more files"
 
 
+def _new_table(path: Path) -> None:
+    """Refuse before any computation what could not be written after it.
+
+    Raises:
+        ScenarioError: It is no name for a table.
+    """
+    if path.suffix.lower() != ".csv" or not path.parent.is_dir():
+        raise ScenarioError(
+            f"--output {path}: give a name that ends in .csv, in a folder that is there"
+        )
+
+
+_JOBS = arg("--jobs N", "processes (default: 1)", type=count_of, default=1)
+
+
+@command(
+    "sweep",
+    "capacitances of a design over a grid of its parameters",
+    arg("design DESIGN.toml", "a design whose file has expressions of parameters", type=Path),
+    arg(
+        "--vary NAME=VALUES",
+        "a parameter: FROM:TO:COUNT or A,B,C, with units mm, cm, m, in; give it once for each one",
+        action="append",
+        required=True,
+    ),
+    arg("-o --output TABLE.csv", "rows are appended as they finish", type=Path, required=True),
+    arg("--scenario FILE.toml", "bodies, as they stand at time 0", type=Path),
+    _JOBS,
+    QUIET,
+)
+def sweep(args: argparse.Namespace) -> int:
+    """Compute the capacitances of the empty domain for all combinations of the parameters, and what
+    the bodies of a scenario change. In DESIGN.toml, a text such as "=side / 2" is an expression.
+    What it will cost is said first. A point whose design cannot be made has an error in the table.
+
+    After an interruption, run the same command: what TABLE.csv holds is not computed again, and the
+    table is the same in the end. More values may be added in the same way.
+
+    examples:
+      capsense sweep pad.toml --vary side=10mm:30mm:5 -o pad.csv
+      capsense sweep pad.toml --vary side=10mm,20mm --vary gap=1mm:3mm:3 -o pad.csv --jobs 2
+      capsense sweep pad.toml --vary side=0.01,0.02 --scenario finger.toml -o pad.csv
+    """
+    from capsense.studies import Capacitances
+    from capsense.studies.sweeps import grid, load_template, parse_vary
+
+    _new_table(args.output)
+    vary: dict[str, list[float]] = {}
+    for text in args.vary:
+        name, values = parse_vary(text)
+        if name in vary:
+            raise ScenarioError(f"--vary {text}: {name} is given twice; list its values in one")
+        vary[name] = values
+    try:
+        points = grid(vary)
+    except ValueError as error:
+        raise ScenarioError(f"--vary: {error}") from None
+    template, folder = load_template(args.design)
+    evaluation = Capacitances.of(args.design.name, template, folder, points, args.scenario)
+    rows = _fill(args, points, evaluation)
+    if not args.quiet:
+        print(f"{len(rows)} rows in {args.output}{_without_results(rows)}")
+    return OK
+
+
+@command(
+    "tolerance",
+    "how capacitances scatter with a design's parameters, and the yield",
+    arg("study STUDY.toml", "a design, what scatters, and specifications", type=Path),
+    arg("-o --output TABLE.csv", "samples, appended as they finish", type=Path, required=True),
+    arg("--plot FILE", "tornado plot: .png, .svg or .pdf", type=Path),
+    _JOBS,
+    QUIET,
+)
+def tolerance(args: argparse.Namespace) -> int:
+    """Draw quasi-random samples of a design's parameters, compute their capacitances, and print for
+    each output its mean and standard deviation, the parameters in the order of their effects with
+    their first-order contributions to the variance, and the yield with its 95 % interval.
+
+    After an interruption, run the same command: what TABLE.csv holds is not computed again.
+
+    examples:
+      capsense tolerance study.toml -o samples.csv
+      capsense tolerance study.toml -o samples.csv --plot tornado.png --jobs 2
+    """
+    from capsense.studies.tolerances import analyse, load_study, tornado
+
+    _new_table(args.output)
+    if args.plot is not None:
+        check_picture("--plot", args.plot, ScenarioError)
+    study, evaluation = load_study(args.study)
+    rows = _fill(args, study.points, evaluation)
+    found = analyse(rows, evaluation.outputs, study.specifications)
+    if args.plot is not None:
+        tornado(found, list(study.specifications) or evaluation.outputs).savefig(args.plot)
+    if not args.quiet:
+        print(_tolerance_report(found))
+        print(f"\n{len(rows)} samples in {args.output}{_without_results(rows)}")
+    return OK
+
+
+def _tolerance_report(found: Tolerances) -> str:
+    """Scatter, ranking and yield as text; warns where the linear fit is poor."""
+    from capsense.studies.tolerances import POOR_FIT
+
+    lines = []
+    for name, output in found.outputs.items():
+        for number, (parameter, effect) in enumerate(output.effects.items()):
+            own = (name, f"{1e15 * output.mean:.4g}", f"{1e15 * output.deviation:.3g}")
+            share = 100 * output.contributions[parameter]
+            lines.append([
+                *(own if number == 0 else ("", "", "")), parameter, f"{1e15 * effect:+.3g}",
+                f"{share:.1f}",
+            ])  # fmt: skip
+        if output.explained < POOR_FIT:
+            say(f"warning: {name}: a linear fit explains {100 * output.explained:.0f} % of the "
+                "variance only, so that contributions are incomplete; see the samples")  # fmt: skip
+    header = ("output", "mean [fF]", "deviation [fF]", "parameter", "effect [fF]", "share [%]")
+    parts = [table(header, lines)]
+    if found.yields:
+        rows = [
+            (name, f"{100 * y.share:.1f}", f"{100 * y.low:.1f} to {100 * y.high:.1f}",
+             f"{y.passed} of {y.samples}")
+            for name, y in found.yields.items()
+        ]  # fmt: skip
+        parts.append(table(("specification", "yield [%]", "95 % interval", "passed"), rows))
+    return "\n\n".join(parts)
+
+
+def _without_results(rows: list[StudyRow]) -> str:
+    """How many rows have an error."""
+    wrong = sum(bool(row.error) for row in rows)
+    return f"; {wrong} without results, see column error" if wrong else ""
+
+
+def _fill(args: argparse.Namespace, points: list[Any], evaluation: Capacitances) -> list[StudyRow]:
+    """Evaluate points into the table ``args.output``: the cost first, then progress."""
+    from capsense.studies.points import fill_table, missing
+    from capsense.studies.sweeps import cost_of
+
+    todo = missing(points, evaluation, args.output)
+    if todo and not args.quiet:
+        panels, each = cost_of(evaluation, todo)
+        done = len(points) - len(todo)
+        kept = f", {done} more are kept or cannot be made" if done else ""
+        say(f"{len(todo)} designs of about {grouped(panels)} panels{kept}: about "
+            f"{_duration(each * len(todo))} of a processor's time")  # fmt: skip
+    try:
+        with Progress(len(todo), "designs", quiet=args.quiet) as progress:
+            return fill_table(points, evaluation, args.output, jobs=args.jobs, each=progress)
+    except KeyboardInterrupt:
+        say(f"what was computed is kept in {args.output}; run it again to go on")
+        raise
+
+
+def _duration(value: float) -> str:
+    return f"{value:.0f} s" if value < 100 else (
+        f"{value / 60:.0f} min" if value < 6000 else f"{value / 3600:.1f} h"
+    )  # fmt: skip
+
+
+class Progress:
+    """Counts what is done: a bar on a terminal, else a line every :data:`EVERY` seconds."""
+
+    def __init__(self, total: int, unit: str, *, quiet: bool) -> None:
+        from tqdm import tqdm
+
+        self._total, self._unit, self._quiet = total, unit, quiet
+        self._count, self._told = 0, perf_counter()
+        self._bar = tqdm(
+            total=total, unit=f" {unit}", file=sys.stderr, disable=not progress_shown(quiet)
+        )
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, count: int) -> None:
+        """So many more are done."""
+        self._count += count
+        self._bar.update(count)
+        if self._quiet or not self._bar.disable or perf_counter() - self._told < EVERY:
+            return
+        self._told = perf_counter()
+        say(f"{self._count} of {self._total} {self._unit}")
+
+
 @command(
     "optimise",
     "choose sizes and gaps of electrodes for a task",
@@ -275,7 +469,7 @@ def optimise(args: argparse.Namespace) -> int:
     """
     from dataclasses import replace
 
-    from capsense.learning.optimise import load_task, search, to_toml
+    from capsense.learning.optimise import at_bounds, load_task, search, to_toml
 
     if args.output.suffix.lower() != ".toml" or not args.output.parent.is_dir():
         raise ScenarioError(
@@ -299,6 +493,9 @@ def optimise(args: argparse.Namespace) -> int:
     found = task.content(values)
     head = f"# {task.name}: found by `capsense optimise {args.task.name}`, {count} candidates.\n"
     args.output.write_text(head + to_toml(found) + "\n", encoding="utf-8")
+    for name, (side, limit) in at_bounds(task, values).items():
+        say(f"warning: {name} ended at its {side} bound, {limit:g}; a better value may lie beyond: "
+            f"widen its range in {args.task}")  # fmt: skip
     if not args.quiet:
         rows = {"found": (values, coarse)}
         if not args.no_check:

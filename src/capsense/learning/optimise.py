@@ -6,10 +6,8 @@ at best, given the sensor's slopes and the noise of its channels.
 
 from __future__ import annotations
 
-import ast
 import json
 import math
-import operator
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -21,13 +19,14 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-from capsense._validate import read_toml, suggest
+from capsense._validate import read_toml
 from capsense.design import Design, parse_design
 from capsense.errors import DesignError, FieldError, ScenarioError
 from capsense.field.background import BuildSettings, build_background
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator
 from capsense.scenario import ScenarioTable as Table
 from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator
+from capsense.studies.template import fill
 
 Array = NDArray[np.float64]
 
@@ -37,9 +36,6 @@ TOP_KEYS = (
 )  # fmt: skip
 _DIGITS = 6
 """Parameters and lengths are rounded to so many digits: a micrometre."""
-_OPERATORS: dict[type, Callable[[float, float], float]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-}  # fmt: skip
 
 
 class Span(NamedTuple):
@@ -98,9 +94,7 @@ class DesignTask:
             DesignError: An expression is wrong.
         """
         named = dict(zip(self.parameters, np.asarray(values).tolist(), strict=True))
-        filled = _filled(self.template, named)
-        assert isinstance(filled, dict)
-        return filled
+        return fill(self.template, named, _DIGITS)
 
     def design(self, values: Array) -> Design:
         """The design for values of the parameters.
@@ -187,6 +181,24 @@ def search(
                      "xatol": 1e-3, "fatol": 1e-4},
         )  # fmt: skip
     return min(tried, key=lambda pair: pair[1].cost)
+
+
+def at_bounds(task: DesignTask, values: Array) -> dict[str, tuple[str, float]]:
+    """Parameters that lie within a hundredth of their range of a bound.
+
+    Args:
+        task: What was to be found.
+        values: Of the parameters, shape (n,).
+
+    Returns:
+        Of each such parameter, ``"lower"`` or ``"upper"``, and the bound.
+    """
+    found = {}
+    for (name, span), value in zip(task.parameters.items(), values.tolist(), strict=True):
+        share = (value - span.low) / (span.high - span.low)
+        if not 0.01 < share < 0.99:
+            found[name] = ("lower", span.low) if share < 0.5 else ("upper", span.high)
+    return found
 
 
 def load_task(path: str | Path) -> DesignTask:
@@ -278,43 +290,3 @@ def _poses(table: Table) -> Iterator[LimbPose]:
         values.append([math.radians(v) for v in many] if angle else many)
     for one in product(*values):
         yield LimbPose(*one)
-
-
-def _filled(value: Any, named: Mapping[str, float]) -> Any:
-    """A nested value in which texts that begin with = are worked out, and rounded to 1 µm."""
-    if isinstance(value, Mapping):
-        return {k: _filled(v, named) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_filled(v, named) for v in value]
-    if isinstance(value, str) and value.startswith("="):
-        return round(evaluate(value[1:], named), _DIGITS)
-    return value
-
-
-def evaluate(text: str, named: Mapping[str, float]) -> float:
-    """The value of an expression of numbers, names, ``+ - * /`` and brackets.
-
-    Raises:
-        DesignError: It is something else, or names an unknown parameter.
-    """
-
-    def of(node: ast.AST) -> float:
-        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-            return float(node.value)  # type: ignore[arg-type]
-        if isinstance(node, ast.Name):
-            if node.id not in named:
-                raise DesignError(f"={text}: no parameter {node.id!r}; {suggest(node.id, named)}")
-            return named[node.id]
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            return -of(node.operand)
-        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
-            return _OPERATORS[type(node.op)](of(node.left), of(node.right))
-        raise DesignError(f"={text} is more than numbers, parameters, + - * / and brackets")
-
-    try:
-        value = of(ast.parse(text.strip(), mode="eval").body)
-    except (SyntaxError, ZeroDivisionError, ValueError, RecursionError) as error:
-        raise DesignError(f"={text} cannot be worked out: {error}") from None
-    if not math.isfinite(value):
-        raise DesignError(f"={text} is {value}; lengths are finite")
-    return value

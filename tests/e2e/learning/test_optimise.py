@@ -16,8 +16,9 @@ import capsense as cs
 from capsense.__main__ import BAD_INPUT, OK, main
 from capsense.errors import DesignError, ScenarioError
 from capsense.learning import optimise
-from capsense.learning.optimise import Bound, DesignTask, evaluate, load_task, search, to_toml
+from capsense.learning.optimise import Bound, DesignTask, at_bounds, load_task, search, to_toml
 from capsense.learning.servo import LimbPose
+from capsense.studies.template import evaluate
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "designs" / "forearm_pads.toml"
 TASK = """
@@ -151,8 +152,20 @@ def test_command(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     design = cs.load_design(output)
     size = float(rows["found"][1]) * 1e-3
     assert design.electrodes[0].surface.area == approx(size**2, rel=2e-3)
-    assert main(["optimise", str(task_file), "-o", "found.txt"]) == BAD_INPUT
+    assert main(["optimize", str(task_file), "-o", "found.txt"]) == BAD_INPUT
     assert main(["optimise", str(task_file), "-o", str(output), "--evaluations", "0"]) == BAD_INPUT
+
+
+def test_what_lies_at_its_bounds() -> None:
+    """Within a hundredth of the range; the middle does not."""
+    task = load_task(EXAMPLE)
+    spans = np.array([p[:2] for p in task.parameters.values()])
+    low, width = spans[:, 0], np.diff(spans)[:, 0]
+    names = list(task.parameters)
+    assert at_bounds(task, low + 0.5 * width) == {}
+    assert at_bounds(task, low + width * [0.995, 0.5, 0.005, 0.02]) == {
+        names[0]: ("upper", spans[0, 1]), names[2]: ("lower", spans[2, 0])
+    }  # fmt: skip
 
 
 @pytest.mark.usefixtures("coarse")

@@ -1,0 +1,283 @@
+"""Tolerances: how capacitances scatter with a design's parameters, and how many sensors pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest, norm, qmc, triang
+
+from capsense._validate import read_toml, suggest
+from capsense.errors import ScenarioError
+from capsense.scenario import ScenarioTable as Table
+from capsense.studies.points import Evaluation, StudyRow, fill_table
+from capsense.studies.sweeps import Capacitances
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+TOP_KEYS = ("name", "samples", "seed", "scenario", "parameters", "specifications", "design")
+KINDS = {
+    "normal": ("mean", "sigma"),
+    "uniform": ("from", "to"),
+    "triangular": ("from", "to", "peak"),
+}
+"""Distributions, and the keys of each."""
+POOR_FIT = 0.9
+"""Where a linear fit explains less of the variance, a warning is given."""
+
+
+class Distribution(NamedTuple):
+    """How a parameter scatters."""
+
+    kind: Literal["normal", "uniform", "triangular"]
+    first: float
+    """Mean of a normal distribution, lower end of others."""
+    second: float
+    """Standard deviation of a normal distribution, upper end of others."""
+    peak: float = 0.0
+    """The most likely value of a triangular distribution."""
+
+    def values(self, shares: Array) -> Array:
+        """Quantiles of shares in (0, 1)."""
+        width = self.second - self.first
+        if self.kind == "normal":
+            return np.asarray(norm.ppf(shares, self.first, self.second))
+        if self.kind == "uniform":
+            return self.first + width * shares
+        return np.asarray(triang.ppf(shares, (self.peak - self.first) / width, self.first, width))
+
+
+class Specification(NamedTuple):
+    """What an output may be [F]."""
+
+    least: float
+    most: float
+
+
+@dataclass(frozen=True, eq=False)
+class ToleranceStudy:
+    """What scatters and what must hold; made by :func:`load_study`."""
+
+    parameters: Mapping[str, Distribution]
+    specifications: Mapping[str, Specification]
+    """Of outputs, by their names."""
+    samples: int = 64
+    """A power of two."""
+    seed: int = 0
+
+    @property
+    def points(self) -> list[dict[str, float]]:
+        """Scrambled Sobol' points, by the parameters' distributions."""
+        sampler = qmc.Sobol(len(self.parameters), rng=np.random.default_rng(self.seed))
+        shares = sampler.random_base2(self.samples.bit_length() - 1)
+        shares = np.clip(shares, 2.0**-32, 1.0 - 2.0**-32)
+        columns = [d.values(shares[:, k]) for k, d in enumerate(self.parameters.values())]
+        rows = np.column_stack(columns).tolist()
+        return [dict(zip(self.parameters, row, strict=True)) for row in rows]
+
+
+@dataclass(frozen=True)
+class Output:
+    """How one output scatters."""
+
+    mean: float
+    deviation: float
+    """Standard deviation."""
+    effects: Mapping[str, float]
+    """Change of the output for one standard deviation of each parameter, by a linear fit; the
+    parameter of largest effect first."""
+    contributions: Mapping[str, float]
+    """First-order shares of each parameter in the variance, in the same order."""
+    explained: float
+    """Share of the variance that the linear fit explains."""
+
+
+class Yield(NamedTuple):
+    """How many samples pass."""
+
+    passed: int
+    samples: int
+    low: float
+    """Lower end of the 95 % interval of the yield, after Wilson."""
+    high: float
+    """Upper end."""
+
+    @property
+    def share(self) -> float:
+        """The yield."""
+        return self.passed / self.samples
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What :func:`analyse` finds."""
+
+    outputs: Mapping[str, Output]
+    yields: Mapping[str, Yield]
+    """For each specification, and for all together under ``all``; empty without specifications.
+    Samples without results do not pass."""
+    without_results: int
+    """Samples whose design cannot be made."""
+
+
+def tolerance(
+    study: ToleranceStudy,
+    evaluation: Evaluation,
+    output: str | Path,
+    *,
+    jobs: int = 1,
+    each: Callable[[int], object] = lambda count: None,
+) -> Tolerances:
+    """Evaluate the samples of a study into a CSV file, as :func:`~capsense.studies.sweep` does, and
+    analyse them.
+
+    Raises:
+        DesignError: No sample has a design.
+        ScenarioError: The file is of another study, or too few samples have results.
+    """
+    rows = fill_table(study.points, evaluation, Path(output), jobs=jobs, each=each)
+    return analyse(rows, evaluation.outputs, study.specifications)
+
+
+def analyse(
+    rows: Sequence[StudyRow], outputs: Sequence[str], specifications: Mapping[str, Specification]
+) -> Tolerances:
+    """Scatter, contributions and yield of samples.
+
+    Raises:
+        ScenarioError: Too few samples have results for a linear fit.
+    """
+    good = [row for row in rows if not row.error]
+    names = list(rows[0].point)
+    if len(good) < len(names) + 2:
+        raise ScenarioError(
+            f"{len(good)} samples have results, too few for a linear fit of {len(names)} "
+            f"parameters; give more than {len(names) + 1}"
+        )
+    x = np.array([list(row.point.values()) for row in good])
+    y = np.array([row.results for row in good])
+    found = {name: _output(names, x, y[:, k]) for k, name in enumerate(outputs)}
+    passed = {
+        name: (y[:, list(outputs).index(name)] >= limits.least)
+        & (y[:, list(outputs).index(name)] <= limits.most)
+        for name, limits in specifications.items()
+    }
+    if passed:
+        passed["all"] = np.logical_and.reduce(list(passed.values()))
+    yields = {name: _yield(int(p.sum()), len(rows)) for name, p in passed.items()}
+    return Tolerances(found, yields, len(rows) - len(good))
+
+
+def _output(names: Sequence[str], x: Array, y: Array) -> Output:
+    centred = y - y.mean()
+    deviations = x.std(axis=0)
+    scaled = (x - x.mean(axis=0)) / np.where(deviations > 0, deviations, 1.0)
+    effects = np.linalg.lstsq(scaled, centred, rcond=None)[0]
+    rest = float(np.mean((centred - scaled @ effects) ** 2))
+    total = float(np.sum(effects**2)) + rest
+    shares = effects**2 / total if total > 0 else np.zeros(len(effects))
+    variance = float(np.mean(centred**2))
+    order = np.argsort(-np.abs(effects), kind="stable").tolist()
+    return Output(
+        mean=float(y.mean()), deviation=float(y.std(ddof=1)),
+        effects={names[k]: float(effects[k]) for k in order},
+        contributions={names[k]: float(shares[k]) for k in order},
+        explained=1.0 - rest / variance if variance > 0 else 1.0,
+    )  # fmt: skip
+
+
+def _yield(passed: int, count: int) -> Yield:
+    interval = binomtest(passed, count).proportion_ci(0.95, method="wilson")
+    return Yield(passed, count, float(interval.low), float(interval.high))
+
+
+def load_study(path: str | Path) -> tuple[ToleranceStudy, Capacitances]:
+    """Load the file of a study; see ``docs/sweeps.md``.
+
+    Raises:
+        ScenarioError: There is no such file, or anything in it is wrong.
+        DesignError: The design is wrong.
+    """
+    file = Path(path)
+    top = Table(read_toml(file, "study", ScenarioError), file.name, "study")
+    top.only(TOP_KEYS)
+    top.string("name")
+    table = Table(top.raw("parameters", "[parameters], what scatters"), file.name, "parameters")
+    if not table.data:
+        raise table.error("is empty; add name = { distribution = …, … }")
+    parameters = {name: _distribution(table, name) for name in table.data}
+    samples = top.integer("samples", 2, 2**16, 64)
+    if samples & (samples - 1) or samples < len(parameters) + 2:
+        raise top.error(
+            f"samples = {samples} must be a power of two above {len(parameters) + 1}, such as 64"
+        )
+    study = ToleranceStudy(parameters, {}, samples, top.integer("seed", 0, 2**63 - 1, 0))
+    folder = file.resolve().parent
+    scenario = folder / top.string("scenario") if "scenario" in top else None
+    template = Table(top.raw("design", "[design], a design's file"), file.name, "design").data
+    evaluation = Capacitances.of(file.name, template, folder, study.points, scenario)
+    limits = Table(top.data.get("specifications", {}), file.name, "specifications")
+    for name in limits.data:
+        if name not in evaluation.outputs:
+            raise limits.error(f"{name!r} is no output; {suggest(name, evaluation.outputs)}")
+    specifications = {name: _limits(limits, name) for name in limits.data}
+    return ToleranceStudy(parameters, specifications, samples, study.seed), evaluation
+
+
+def _distribution(table: Table, name: str) -> Distribution:
+    one = Table(table.data[name], table.source, f"parameter {name!r}")
+    if not name.isidentifier():
+        raise one.error("is no name for expressions; use letters, digits and _")
+    kind: Any = one.choice("distribution", list(KINDS))
+    one.only(("distribution", *KINDS[kind]))
+    if kind == "normal":
+        mean, sigma = one.number("mean", -1e6, 1e6), one.number("sigma", 0.0, 1e6)
+        if not sigma > 0:
+            raise one.error("sigma = 0; write the number in the design instead")
+        return Distribution(kind, mean, sigma)
+    low = one.number("from", -1e6, 1e6)
+    high = one.number("to", low, 1e6)
+    if not high > low:
+        raise one.error(f"from = to = {low:g}; write the number in the design instead")
+    peak = one.number("peak", low, high, 0.5 * (low + high)) if kind == "triangular" else 0.0
+    return Distribution(kind, low, high, peak)
+
+
+def _limits(table: Table, name: str) -> Specification:
+    one = Table(table.data[name], table.source, f"specification {name!r}")
+    one.only(("min", "max"))
+    if not one.data:
+        raise one.error("has neither min nor max; give one or both, in F")
+    least = one.number("min", -1.0, 1.0, -np.inf, unit="F")
+    most = one.number("max", -1.0, 1.0, np.inf, unit="F")
+    if not least <= most:
+        raise one.error(f"min = {least:g} is above max = {most:g}; exchange them")
+    return Specification(least, most)
+
+
+def tornado(found: Tolerances, outputs: Sequence[str]) -> Figure:
+    """Bars of each parameter's effect on outputs [fF], the largest on top.
+
+    Raises:
+        KeyError: There is no such output.
+    """
+    from matplotlib.figure import Figure
+
+    from capsense._style import COLOURS, dress
+
+    rows = max(len(found.outputs[name].effects) for name in outputs)
+    figure = Figure(figsize=(7, len(outputs) * (1.0 + 0.3 * rows)), layout="constrained")
+    for axes, name in zip(figure.subplots(len(outputs), squeeze=False)[:, 0], outputs, strict=True):
+        effects = found.outputs[name].effects
+        sizes = [1e15 * abs(e) for e in effects.values()]
+        axes.barh(list(effects), [2 * s for s in sizes], left=[-s for s in sizes], color=COLOURS[0])
+        axes.invert_yaxis()
+        dress(axes, x="change for ± one standard deviation [fF]", title=name)
+    return figure
