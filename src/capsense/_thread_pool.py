@@ -7,8 +7,9 @@ import os
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,6 +24,9 @@ Key = TypeVar("Key", bound=Hashable)
 Result = TypeVar("Result")
 
 
+_TURNS = 6
+"""Calls for tasks that share them, for each thread, at least: no thread then waits long for
+another."""
 _PARTS = 8
 """Parts of a piece of work, for each thread: no thread then waits long for another."""
 
@@ -159,6 +163,34 @@ class ThreadPool:
             {key: results[key] for key in tasks if key in results},
             {key: failures[key] for key in tasks if key in failures},
         )
+
+    def run_together(
+        self,
+        groups: Iterable[Sequence[Key]],
+        most: int,
+        work: Callable[[Sequence[Key]], Sequence[Result | CapSenseError]],
+    ) -> tuple[dict[Key, Result], dict[Key, CapSenseError]]:
+        """As :meth:`run`, for tasks of which several are done in one call; in the groups' order.
+
+        Args:
+            groups: Keys of tasks that may share a call, group by group.
+            most: So many share one at most; fewer where threads would have few calls each.
+            work: Does some tasks of a group: what each gave, or its error.
+        """
+        lists = list(groups)
+        size = -(-sum(map(len, lists)) // (_TURNS * self.threads))
+        size = max(1, min(most, size))
+        parts = [keys[k : k + size] for keys in lists for k in range(0, len(keys), size)]
+        done, lost = self.run({n: partial(work, keys) for n, keys in enumerate(parts)})
+        results: dict[Key, Result] = {}
+        failures: dict[Key, CapSenseError] = {}
+        for n, keys in enumerate(parts):
+            for key, found in zip(keys, done.get(n) or len(keys) * [lost[n]], strict=True):
+                if isinstance(found, CapSenseError):
+                    failures[key] = found
+                else:
+                    results[key] = found
+        return results, failures
 
 
 def some_failed(what: str, failures: Mapping[Key, CapSenseError], count: int) -> str:

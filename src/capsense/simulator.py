@@ -6,7 +6,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, get_args
@@ -42,10 +41,6 @@ DEFAULT_PRESET: PresetName = "standard"
 DEFAULT_DESIGN = "six_patch"
 """The design of whatever is given none."""
 _OTHER_NAMES: dict[str, PresetName] = {"learning": "fast"}
-
-_TURNS = 6
-"""Parts of a batch, for each thread, at least: no thread then waits long for another."""
-
 
 _DOUBTFUL, _SEEN = 0.1, 1e-4
 """Estimated errors are warned of above this part of a change, and of the largest capacitance."""
@@ -439,25 +434,18 @@ class Simulator:
         for number, scene in enumerate(scenes):
             check_view(f"scenes[{number}]: a batch holds", scene)
 
-        pool = ThreadPool(threads)
-        size = min(self._solver.together, -(-len(scenes) // (_TURNS * pool.threads)))
-        starts = range(0, len(scenes), max(size, 1))
-        parts, lost = pool.run({k: partial(self._each, scenes[k : k + size]) for k in starts})
-        readings: dict[int, Reading] = {}
-        failures: dict[int, CapSenseError] = {}
-        for k in starts:
-            for number, found in enumerate(parts.get(k) or size * [lost[k]], k):
-                if isinstance(found, Reading):
-                    readings[number] = found
-                else:
-                    failures[number] = found
+        readings, failures = ThreadPool(threads).run_together(
+            [range(len(scenes))], self.together,
+            lambda some: read_together([self] * len(some), [scenes[k] for k in some]),
+        )  # fmt: skip
         if failures:
             raise BatchError(some_failed("scenes", failures, len(scenes)), readings, failures)
         return list(readings.values())
 
-    def _each(self, scenes: Sequence[Scene | DepthFrame]) -> list[Reading | CapSenseError]:
-        """Readings of scenes, each from rest, or what was wrong with them."""
-        return read_together([self] * len(scenes), scenes)
+    @property
+    def together(self) -> int:
+        """How many scenes a thread takes at a time, at most."""
+        return self._solver.together
 
     @property
     def kind(self) -> Hashable:

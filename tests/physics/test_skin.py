@@ -112,6 +112,18 @@ def test_sensors_move(tiny: cs.Simulator) -> None:
     assert np.array_equal(skin.step(cs.Scene([ball]))["far"].delta, expected)
 
 
+def test_many_sensors_are_read_as_one_by_one(tiny: cs.Simulator) -> None:
+    """Differential, to the last bit, where several are solved in one call; each counts a step."""
+    poses = {f"{n}{k}": p @ cs.Pose((0, 0, 0.003 * k)) for k in range(4) for n, p in POSES.items()}
+    skin = cs.Skin({name: (tiny.copy(), pose) for name, pose in poses.items()}, threads=1)
+    alone = tiny.copy()
+    for scene in scenes(3):
+        views = skin.views(scene)
+        for name, reading in skin.step(scene).items():
+            assert same(reading, alone.step(views[name]))
+    assert [simulator.steps for simulator in skin.simulators.values()] == [3] * len(poses)
+
+
 def test_sensors_of_one_design_share_its_field(tiny: cs.Simulator) -> None:
     """A given simulator is used once; copies have its field and settings, not its state."""
     made = make_simulators({"a": tiny, "b": tiny, "c": "arm_segment", "d": "arm_segment"})

@@ -119,6 +119,14 @@ def check_picture(option: str, path: Path, error: type[CapSenseError]) -> None:
         raise error(f"{option} {path}: there is no folder {path.parent}; make it first")
 
 
+def check_target(option: str, path: Path, ending: str, error: type[CapSenseError]) -> None:
+    """Refuse before any computation what could not be written after it."""
+    if path.suffix.lower() != ending or not path.parent.is_dir():
+        raise error(
+            f"{option} {path}: give a name that ends in {ending}, in a folder that is there"
+        )
+
+
 class Interrupt:
     """While in its ``with`` block, takes SIGINT and SIGTERM.
 

@@ -7,7 +7,17 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli import OK, PICTURES, arg, check_picture, command, facts, grouped, table
+from capsense.cli import (
+    OK,
+    PICTURES,
+    arg,
+    check_picture,
+    check_target,
+    command,
+    facts,
+    grouped,
+    table,
+)
 from capsense.errors import LayoutError
 
 if TYPE_CHECKING:
@@ -73,12 +83,8 @@ def layout(args: argparse.Namespace) -> int:
     """
     if args.plot is not None:
         check_picture("--plot", args.plot, LayoutError)
-    if args.output is not None and (
-        args.output.suffix.lower() != ".toml" or not args.output.parent.is_dir()
-    ):
-        raise LayoutError(
-            f"--output {args.output}: give a name that ends in .toml, in a folder that is there"
-        )
+    if args.output is not None:
+        check_target("--output", args.output, ".toml", LayoutError)
     from capsense.layout import load_layout
 
     found = load_layout(args.layout, tolerance=args.tolerance, thickness=args.thickness)

@@ -19,6 +19,7 @@ from capsense.cli import (
     BuildProgress,
     arg,
     check_picture,
+    check_target,
     command,
     count_of,
     facts,
@@ -256,18 +257,6 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:shown])} and {len(names) - shown} more files"
 
 
-def _new_table(path: Path) -> None:
-    """Refuse before any computation what could not be written after it.
-
-    Raises:
-        ScenarioError: It is no name for a table.
-    """
-    if path.suffix.lower() != ".csv" or not path.parent.is_dir():
-        raise ScenarioError(
-            f"--output {path}: give a name that ends in .csv, in a folder that is there"
-        )
-
-
 _JOBS = arg("--jobs N", "processes (default: 1)", type=count_of, default=1)
 
 
@@ -302,7 +291,7 @@ def sweep(args: argparse.Namespace) -> int:
     from capsense.studies import Capacitances
     from capsense.studies.sweeps import grid, load_template, parse_vary
 
-    _new_table(args.output)
+    check_target("--output", args.output, ".csv", ScenarioError)
     vary: dict[str, list[float]] = {}
     for text in args.vary:
         name, values = parse_vary(text)
@@ -343,7 +332,7 @@ def tolerance(args: argparse.Namespace) -> int:
     """
     from capsense.studies.tolerances import analyse, load_study, tornado
 
-    _new_table(args.output)
+    check_target("--output", args.output, ".csv", ScenarioError)
     if args.plot is not None:
         check_picture("--plot", args.plot, ScenarioError)
     study, evaluation = load_study(args.study)
@@ -471,10 +460,7 @@ def optimise(args: argparse.Namespace) -> int:
 
     from capsense.learning.optimise import at_bounds, load_task, search, to_toml
 
-    if args.output.suffix.lower() != ".toml" or not args.output.parent.is_dir():
-        raise ScenarioError(
-            f"--output {args.output}: give a name that ends in .toml, in a folder that is there"
-        )
+    check_target("--output", args.output, ".toml", ScenarioError)
     task = load_task(args.task)
     if args.evaluations is not None:
         if args.evaluations < 1:

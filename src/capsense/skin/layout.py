@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -33,6 +34,18 @@ _READ = 5e-4
 """About how long a patch that sees something takes to read [s] (``examples/painted_skin.py``)."""
 
 
+def checked_length(name: str, value: object) -> float:
+    """A length from 10 µm to 1 m.
+
+    Raises:
+        SceneError: It is none.
+    """
+    number = as_number(value)
+    if not 1e-5 <= number <= 1.0:
+        raise SceneError(f"{name} is {value!r}; give a length in metres, such as 0.012")
+    return number
+
+
 @dataclass(frozen=True)
 class Pad:
     """A disc electrode that is bent with the link.
@@ -50,10 +63,7 @@ class Pad:
 
     def __post_init__(self) -> None:
         for name in ("size", "depth"):
-            if not 1e-5 <= as_number(getattr(self, name)) <= 1.0:
-                raise SceneError(
-                    f"{name} is {getattr(self, name)!r}; give a length in metres, such as 0.012"
-                )
+            checked_length(name, getattr(self, name))
         if self.housing not in ("shield", "ground"):
             raise SceneError(f"housing is {self.housing!r}; give 'shield' or 'ground'")
 
@@ -125,14 +135,18 @@ class SkinLayout(Mapping[str, tuple[Design, Pose]]):
             )
         return replace(self, patches=kept, left_out=out)
 
+    @cached_property
+    def _build_seconds(self) -> float:
+        """Estimated time of building the fields [s]; their panels are cut once for that."""
+        designs = {id(d): d for d, _ in self.patches.values()}.values()
+        return sum(build_cost(build_model(d.in_units).panels.size)[0] for d in designs)
+
     def __repr__(self) -> str:
         designs = {id(d): d for d, _ in self.patches.values()}
         electrodes = sum(len(d.electrodes) for d, _ in self.patches.values())
-        panels = [build_model(design.in_units).panels.size for design in designs.values()]
-        seconds = sum(build_cost(count)[0] for count in panels)
         lines = [
             f"{len(self)} patches, {electrodes} electrodes, {len(designs)} distinct designs",
-            f"to build: about {seconds:.0f} s, or nothing where fields are cached",
+            f"to build: about {self._build_seconds:.0f} s, or nothing where fields are cached",
             f"to read: at most about {1e3 * _READ * len(self):.0f} ms on one core, "
             "less where few patches see something",
         ]

@@ -15,11 +15,12 @@ from scipy.spatial import KDTree
 
 from capsense._validate import as_number
 from capsense.design import load_design
+from capsense.design.film import Film
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Pose
 from capsense.scene.surface import connected_parts
-from capsense.skin.layout import FLATTEST, Pad, SkinLayout, pad_design
+from capsense.skin.layout import FLATTEST, Pad, SkinLayout, checked_length, pad_design
 from capsense.skin.surface import (
     Fit,
     LinkMesh,
@@ -78,7 +79,7 @@ def from_mesh(
     """
     wanted = _checked_count(count, spacing)
     chosen_patch, width = _checked_patch(patch)
-    apart = width if spacing is None else _positive("spacing", spacing)
+    apart = width if spacing is None else checked_length("spacing", spacing)
     if apart < width:
         raise SceneError(
             f"spacing is {1e3 * apart:g} mm, less than the {1e3 * width:g} mm of a patch, so they "
@@ -261,12 +262,7 @@ def _ring(ring: Any) -> list[list[float]]:
 
 def _unrolled(points: Array, radius: float) -> Array:
     """Coordinates of the film of points in the frame of a patch [m], shape (..., 3)."""
-    if math.isinf(radius):
-        return points
-    x, y, z = np.moveaxis(points, -1, 0)
-    return np.stack(
-        [radius * np.arctan2(x, z + radius), y, np.hypot(x, z + radius) - radius], axis=-1
-    )
+    return points if math.isinf(radius) else Film(radius, {}).coordinates(points)
 
 
 def _layout(
@@ -417,10 +413,3 @@ def _checked_count(count: object, spacing: object) -> int | None:
     if not (number.is_integer() and 1 <= number <= 10_000):
         raise SceneError(f"count is {count!r}; give a whole number from 1 to 10000")
     return int(number)
-
-
-def _positive(name: str, value: object) -> float:
-    number = as_number(value)
-    if not 1e-5 <= number <= 1.0:
-        raise SceneError(f"{name} is {value!r}; give a length in metres, such as 0.012")
-    return number

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable, Mapping
-from functools import partial
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -21,9 +20,6 @@ from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Simulator, check_view, read_together
 
 Array = NDArray[np.float64]
-_TOGETHER, _TURNS = 32, 3
-"""So many sensors are solved in one call at most; and so many calls there are for each thread, at
-least."""
 AnyDesign = Design | str | Path | Simulator
 
 
@@ -268,10 +264,8 @@ def read_all(
     kinds: dict[Hashable, list[str]] = {}
     for name, simulator in simulators.items():
         kinds.setdefault(simulator.kind, []).append(name)
-    size = max(1, min(_TOGETHER, -(-len(simulators) // (_TURNS * pool.threads))))
-    parts = [names[k : k + size] for names in kinds.values() for k in range(0, len(names), size)]
 
-    def read(names: list[str]) -> dict[str, Reading | CapSenseError]:
+    def read(names: Sequence[str]) -> list[Reading | CapSenseError]:
         out: dict[str, Reading | CapSenseError] = {}
         seen: dict[str, Scene | DepthFrame] = {}
         for name in names:
@@ -282,29 +276,22 @@ def read_all(
             except CapSenseError as error:
                 out[name] = error
         if len(names) > 1 and seen:
-            found = read_together([simulators[name] for name in seen], list(seen.values()))
-            out |= zip(seen, found, strict=True)
-        for name in names:
-            reading = out[name]
+            out |= zip(seen, read_together([simulators[n] for n in seen], list(seen.values())),
+                       strict=True)  # fmt: skip
+            for name in seen:
+                simulators[name].steps += 1
+        for name, reading in out.items():
             if isinstance(reading, Reading):
                 try:
                     out[name] = sampled(name, reading)
                 except CapSenseError as error:
                     out[name] = error
-        return out
+        return [out[name] for name in names]
 
-    done, lost = pool.run({k: partial(read, names) for k, names in enumerate(parts)})
-    readings: dict[str, Reading] = {}
-    failures: dict[str, CapSenseError] = {}
-    for k, names in enumerate(parts):
-        for name in names:
-            result = lost[k] if k in lost else done[k][name]
-            if isinstance(result, Reading):
-                readings[name] = result
-            else:
-                failures[name] = result
-    readings = {name: readings[name] for name in simulators if name in readings}
-    failures = {name: failures[name] for name in simulators if name in failures}
-    if failures:
+    most = max(simulator.together for simulator in simulators.values()) if simulators else 1
+    found, failed = pool.run_together(kinds.values(), most, read)
+    readings = {name: found[name] for name in simulators if name in found}
+    if failed:
+        failures = {name: failed[name] for name in simulators if name in failed}
         raise SkinError(some_failed("sensors", failures, len(simulators)), readings, failures)
     return readings
