@@ -3,7 +3,8 @@
 Numba hands a tuple on to another function entry by entry, and an array by seven to nine values: a
 Green's function is some 250 arguments of each function that takes it. A class that is decorated by
 :func:`by_reference` is unpacked once where Python calls a kernel; from there on one address is
-handed on. A step takes three quarters of the time. The tuple is read only: kernels cannot make one.
+handed on. A step takes three quarters of the time, a scene of a batch as long. The tuple is read
+only: kernels cannot make one.
 This stands on Numba's public interface for extensions (``numba.extending``).
 """
 

@@ -210,7 +210,7 @@ def _nothing_collected() -> Iterator[None]:
 
 
 _LEVEL = int(os.environ.get("NUMBA_OPT", "1").replace("max", "3"))
-"""LLVM's level of optimisation. At 3 compiling takes a third longer, and steps take as long."""
+"""LLVM's level of optimisation. At 3 compiling takes a tenth longer, and steps take as long."""
 
 
 @contextmanager
