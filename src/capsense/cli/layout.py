@@ -78,7 +78,7 @@ def layout(args: argparse.Namespace) -> int:
     examples:
       capsense layout board.kicad_pcb
       capsense layout board.kicad_pcb --electrode "TOUCH*" --ground GND -o board.toml
-      capsense layout board.kicad_pcb --electrode "T?" --shield GUARD --cover acrylic:3 -o board.toml
+      capsense layout board.kicad_pcb --electrode "T?" --ground GND --cover acrylic:3 -o a.toml
     """
     if args.plot is not None:
         check_picture("--plot", args.plot, LayoutError)
