@@ -63,6 +63,7 @@ STL_KEYS = ("file", "unit", "scale", "part", "closed")
 TOP_KEYS = (
     "name",
     "description",
+    "grounding",
     "domain",
     "electrode",
     "electrodes_from_stl",
@@ -204,7 +205,12 @@ def parse_design(
         film=film,
     )
     check_design(design, source=source)
-    return design
+    if "grounding" not in data:
+        return design
+    try:
+        return design.with_grounding(data["grounding"])
+    except DesignError as error:
+        raise top.error(str(error)) from None
 
 
 def _read_domain(table: DesignTable) -> Domain:

@@ -15,6 +15,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._validate import as_number, shorten
+from capsense.cover import GROUND as COVER_GROUND
 from capsense.cover import Cover
 from capsense.design.film import Film
 from capsense.design.geometry import (
@@ -35,6 +37,8 @@ Array = NDArray[np.float64]
 
 _INFINITY = 1e5
 """How many box sizes below an open domain its ground lies."""
+_LARGEST_TIE = 1e-3
+"""Capacitances to earth beyond this [F] are slips of the pen."""
 _SIGHT = 10.0
 """How many box sizes beyond an open domain bodies still count."""
 
@@ -82,6 +86,10 @@ class Domain:
         """This domain with lengths in a unit [m]."""
         x, y, z, depth = measured(np.array([*self.size, self.backplane]), unit).tolist()
         return Domain((x, y, z), depth, self.open)
+
+
+LOCAL_GROUND = "local ground"
+"""Name of the terminal that all conductors at ground are where they are not earthed."""
 
 
 class Role(StrEnum):
@@ -161,6 +169,50 @@ class Design:
     any, are among ``layers`` and ``conductors``."""
     film: Film | None = None
     """What ``[bend]`` rolled onto a cylinder, if it did, as it was before."""
+    ground_capacitance: float | None = None
+    """Capacitance from the local ground, that of the readout and of the conductors at ground, to
+    earth [F]: 0 where it floats; None where it is earthed. Walls and floor of the domain are
+    earth."""
+
+    @property
+    def local_ground(self) -> bool:
+        """Whether its conductors at ground are a terminal of their own, apart from earth."""
+        return self.ground_capacitance is not None and any(
+            c.role == Role.GROUND for c in self.conductors
+        )
+
+    def with_grounding(self, grounding: str | float) -> Design:
+        """This design with its local ground on earth, floating, or tied to earth.
+
+        Args:
+            grounding: ``"grounded"``, ``"floating"``, or the capacitance to earth [F].
+
+        Raises:
+            DesignError: It is none of these, or the cover has a fabric at ground, whose compression
+                is known for an earthed ground only.
+        """
+        if isinstance(grounding, str) and grounding == "grounded":
+            return replace(self, ground_capacitance=None)
+        tie = 0.0
+        if not (isinstance(grounding, str) and grounding == "floating"):
+            tie = as_number(grounding)
+            if not 0.0 < tie <= _LARGEST_TIE:
+                raise DesignError(
+                    f'grounding = {shorten(grounding)}; give "grounded", "floating", or the '
+                    "capacitance from the local ground to earth in farads, like 100e-12, up to "
+                    f"{_LARGEST_TIE:g}"
+                )
+        if LOCAL_GROUND in (sheet.name for sheet in self.sheets):
+            raise DesignError(
+                f"grounding = {grounding!r}, but an electrode or conductor is named "
+                f"{LOCAL_GROUND!r}, as the terminal of all conductors at ground is then; rename it"
+            )
+        if self.cover is not None and self.cover.top == COVER_GROUND:
+            raise DesignError(
+                f"grounding = {grounding!r}, but cover {self.cover.name!r} has a fabric at ground "
+                'on top, which must be earthed; give top = "none", or grounding = "grounded"'
+            )
+        return replace(self, ground_capacitance=tie)
 
     def content_hash(self) -> str:
         """SHA-256 (hex) over the geometry, materials and domain.
@@ -178,6 +230,7 @@ class Design:
         lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")
         lines += ["open"] * self.domain.open
         lines += ["its cover gives way"] * (self.cover is not None)
+        lines += ["its ground is a terminal"] * self.local_ground
         lines += [] if self.film is None else [f"bent {_nanometres(np.array(self.film.radius))}"]
         for electrode in self.electrodes:
             lines += ["electrode", *_surface_lines(electrode.surface)]

@@ -73,7 +73,8 @@ class BackgroundField:
     capacitance: Array
     """Maxwell matrix [F] of all terminals, shape (terminals, terminals)."""
     terminals: tuple[str, ...]
-    """Names: electrodes in matrix order, then shields, then floating conductors."""
+    """Names: electrodes in matrix order, then shields, then floating conductors, then the local
+    ground, if it is not earthed."""
     n_panels: int
     """Size of the boundary-element system."""
     green: GreenFunction
@@ -134,7 +135,18 @@ def build_background(
 class Terminals:
     """The terminals of a design: t in all, of which k are driven: n electrodes, then shields.
 
-    Matrices are given for all terminals, floating conductors of the design last.
+    Matrices are given for all terminals: behind the driven ones come floating conductors of the
+    design, then its local ground, where it is not earthed. They are reduced to the driven ones,
+    with their potentials against the local ground, by the network that the others make:
+
+        ``C' = Bᵀ M (B + N U)``,  ``U = −(Nᵀ M N + G)⁻¹ Nᵀ M B``.
+
+    Columns of B are the potentials of all terminals for each driven one at 1 V; columns of N those
+    for each free conductor at 1 V: a floating one alone, and the local ground with all that are
+    driven against it. G holds the capacitance from the local ground to earth. Whatever charge goes
+    out to the driven terminals comes from the local ground, so that electrodes, shields and ground
+    together hold what that capacitance lacks: ``C' = C − c cᵀ/(s + C_g)`` without floating
+    conductors, c being their capacitances to earth, the rows' sums, and s their sum.
 
     Args:
         design: The design.
@@ -143,10 +155,19 @@ class Terminals:
 
     def __init__(self, design: Design, empty_maxwell: Array) -> None:
         self.electrodes = len(design.electrodes)
-        self.driven = len(empty_maxwell) - sum(c.role == Role.FLOATING for c in design.conductors)
+        floating = sum(c.role == Role.FLOATING for c in design.conductors)
+        self.driven = len(empty_maxwell) - floating - design.local_ground
         """How many electrodes there are, n, and how many terminals are driven, k."""
+        self._free = np.eye(len(empty_maxwell))[:, self.driven : self.driven + floating]
+        """N: potentials of all terminals for each free conductor at 1 V, shape (t, free)."""
+        self._ties = np.zeros(floating)
+        """Capacitance of each free conductor to earth [F]."""
+        if design.ground_capacitance is not None:
+            board = 1.0 - self._free.sum(axis=1)
+            self._free = np.column_stack([self._free, board])
+            self._ties = np.append(self._ties, design.ground_capacitance)
         self.empty_maxwell = empty_maxwell
-        self.empty: Array = self._without_floating(empty_maxwell)
+        self.empty: Array = self._reduced(empty_maxwell)
         """Maxwell matrix of the driven terminals in the empty domain [F], shape (k, k)."""
         self.bound: Array = np.maximum(
             -empty_maxwell, 0.0
@@ -166,9 +187,9 @@ class Terminals:
 
     def change(self, change: NDArray[Any]) -> NDArray[Any]:
         """Change of the driven terminals' matrix by that of all, (..., t, t) -> (..., k, k)."""
-        if self.driven == len(self.empty_maxwell):
+        if not len(self._ties):
             return change
-        return self._without_floating(self.empty_maxwell + change) - self.empty
+        return self._reduced(self.empty_maxwell + change) - self.empty
 
     def slope(self, change: NDArray[Any], slope: Array) -> Array:
         """Derivative of the electrodes' matrix by that of all terminals.
@@ -181,22 +202,22 @@ class Terminals:
             Shape (..., b, n, n, 6).
         """
         n = self.electrodes
-        if self.driven == len(self.empty_maxwell):
+        if not len(self._ties):
             return slope[..., :n, :n, :]
-        own, cross = self._floating(self.empty_maxwell + change)
-        follow = np.zeros((*change.shape[:-2], len(self.empty_maxwell), n), change.dtype)
-        follow[..., :n, :] = np.eye(n)
-        follow[..., self.driven :, :] = -np.linalg.solve(own, cross[..., :n])
+        follow = np.eye(len(self.empty_maxwell), n) - self._free @ np.linalg.solve(
+            *self._network(self.empty_maxwell + change, n)
+        )
         return np.einsum("...ai,...bacm,...cj->...bijm", follow, slope, follow)
 
-    def _floating(self, matrix: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Blocks of floating conductors: with themselves, and with the driven terminals."""
-        k = self.driven
-        return matrix[..., k:, k:], matrix[..., k:, :k]
+    def _network(self, matrix: NDArray[Any], count: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Nᵀ M N + G of the free conductors, and Nᵀ M B for the first driven terminals."""
+        side = self._free.T @ matrix
+        return side @ self._free + np.diag(self._ties), side[..., :count]
 
-    def _without_floating(self, matrix: NDArray[Any]) -> NDArray[Any]:
+    def _reduced(self, matrix: NDArray[Any]) -> NDArray[Any]:
+        """The matrix of the driven terminals against the local ground, (..., k, k)."""
         k = self.driven
-        if k == len(self.empty_maxwell):
+        if not len(self._ties):
             return matrix
-        own, cross = self._floating(matrix)
+        own, cross = self._network(matrix, k)
         return matrix[..., :k, :k] - cross.swapaxes(-1, -2) @ np.linalg.solve(own, cross)

@@ -212,8 +212,8 @@ def cache_key(design: Design, settings: BuildSettings) -> str:
     The content hash of a design leaves the order of shields and floating conductors out, but their
     columns of a field come in that order, so it enters here.
     """
-    extra = terminals(design)[len(design.electrodes) :]
     by_name = {c.name: c for c in design.conductors}
+    extra = [name for name in terminals(design)[len(design.electrodes) :] if name in by_name]
     order = [
         Design("", design.domain, (), conductors=(by_name[name],)).content_hash() for name in extra
     ]

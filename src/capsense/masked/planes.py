@@ -17,7 +17,7 @@ from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.field.background import MeshSettings
-from capsense.field.boundary import terminals
+from capsense.field.boundary import terminal_of
 from capsense.masked.mesh_sensor import MeshSensor
 from capsense.mesh import kuhn_tets
 from capsense.mesh.tetmesh import GROUND
@@ -106,10 +106,10 @@ def hold_nodes(design: Design, axes: Axes) -> Owner:
 
     Nodes on the outer faces belong to ``WALL``.
     """
-    names = terminals(design)
     owner = np.full(tuple(len(a) for a in axes), FREE, dtype=np.int64)
     for body in design.sheets:
-        who = names.index(body.name) if body.name in names else WALL
+        number = terminal_of(body, design)
+        who = number if number >= 0 else WALL
         for facet in body.surface.facets:
             _claim(axes, owner, facet, who)
     for axis in range(3):
