@@ -37,7 +37,7 @@ from capsense.scene import (
     SurfaceMesh,
     TriMesh,
 )
-from capsense.scene.materials import ColeCole
+from capsense.scene.materials import ColeCole, Ties
 
 Fields = dict[str, Any]
 
@@ -166,14 +166,16 @@ def body_fields(body: Body) -> Fields:
     """Fields of a ``Body`` message, without its id and its shape."""
     matter, law = body.material, body.material.dispersion
     terms = () if law is None else (law.eps_inf, law.sigma, *(v for t in law.terms for v in t))
-    tied = not isinstance(body.grounding, str)
+    tied, grounding = isinstance(body.grounding, float), body.grounding
+    if isinstance(grounding, Ties):
+        grounding = f"ties {float(grounding.earth)!r} {float(grounding.local)!r}"
     return {
         "name": body.name or "",
         "material": matter.name,
         "eps_r": matter.eps_r,
         "sigma": matter.sigma,
         "dispersion": np.array(terms, dtype=float),
-        "grounding": "capacitance" if tied else body.grounding,
+        "grounding": "capacitance" if tied else grounding,
         "farads": body.grounding if tied else 0.0,
     }
 
@@ -195,6 +197,8 @@ def read_body(message: Any, shapes: Mapping[int, Shape]) -> Body:
         matter = Material(message.material, message.eps_r, message.sigma, dispersion=law)
         tied = message.grounding == "capacitance"
         grounding = message.farads if tied else message.grounding
+        if not tied and grounding.startswith("ties "):
+            grounding = Ties(*map(float, grounding.split()[1:]))
         return Body(shapes[message.shape], Pose(), matter, grounding, message.name or None)
     except (SceneError, TypeError, ValueError) as error:
         raise RecordingError(f"body {message.id} is damaged: {error}") from None

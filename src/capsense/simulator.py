@@ -328,8 +328,9 @@ class Simulator:
         if found.loss is not None:
             change = change - 1j * found.loss
         slope = None if found.jacobian is None else terminals.slope(change, found.jacobian)
-        change = terminals.change(change)
+        whole, change = change, terminals.change(change)
         total = terminals.empty + change
+        error = float(terminals.error(np.array(error), whole, change))
         error = min(error, float(np.abs(total).max()))
         stats = StepStats(error, seconds, found.unknowns, found.iterations)
         if self._doubtful < error and not math.isinf(found.error):

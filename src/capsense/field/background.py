@@ -162,6 +162,7 @@ class Terminals:
         """N: potentials of all terminals for each free conductor at 1 V, shape (t, free)."""
         self._ties = np.zeros(floating)
         """Capacitance of each free conductor to earth [F]."""
+        self._floats = design.ground_capacitance is not None
         if design.ground_capacitance is not None:
             board = 1.0 - self._free.sum(axis=1)
             self._free = np.column_stack([self._free, board])
@@ -190,6 +191,28 @@ class Terminals:
         if not len(self._ties):
             return change
         return self._reduced(self.empty_maxwell + change) - self.empty
+
+    def error(self, error: Array, change: NDArray[Any], reduced: NDArray[Any]) -> Array:
+        """Estimated errors [F] of matrices against the local ground, shape (...).
+
+        Those of the largest change of an electrode, in proportion: potentials against earth are
+        smaller where the local ground is free, and so are the charges of bodies.
+
+        Args:
+            error: Of the matrices of all terminals, shape (...).
+            change: The changes of these, shape (..., t, t).
+            reduced: The same, reduced, shape (..., k, k).
+        """
+        if not self._floats:
+            return error
+        n = self.electrodes
+        before, after = (
+            np.abs(np.diagonal(m, axis1=-2, axis2=-1)[..., :n]).max(axis=-1)
+            for m in (change, reduced)
+        )
+        return np.where(np.isinf(error) | (before == 0.0), error, error * after / np.where(
+            before == 0.0, 1.0, before
+        ))  # fmt: skip
 
     def slope(self, change: NDArray[Any], slope: Array) -> Array:
         """Derivative of the electrodes' matrix by that of all terminals.

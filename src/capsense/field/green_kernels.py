@@ -161,6 +161,8 @@ class Green(NamedTuple):
     """How many of them are terminals."""
     electrodes: int
     """How many of these are electrodes, which come first."""
+    local: int
+    """Number of the terminal that is the local ground; -1 where that is earth."""
     floor: float
     """Height of the floor [m]."""
     box: NDArray[Any]
@@ -227,6 +229,7 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         phi_columns,
         terminals,
         len(design.electrodes),
+        terminals - 1 if design.local_ground else -1,
         float(green.floor),
         np.asarray(green.box, float),
         np.asarray(green.blends, float),

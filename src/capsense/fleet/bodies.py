@@ -180,6 +180,11 @@ class BodyTable:
                 f"{type(body.shape).__name__} is not rigid; a fleet takes primitives and TriMesh"
             )
         matter, length = self._solver.matter_of([body]), self._solver.length
+        if matter.local is not None:
+            raise SceneError(
+                f"grounding is {body.grounding!r}, but fleets know no ties to a local ground that "
+                "floats; give another grounding, or take a Simulator"
+            )
         whole = body.shape.measured_in(length)
         window, _ = windowed(whole, np.zeros(3), self._solver.reach)
         shape, size = self._solver.functions_of(window, bool(matter.conducting[0]))

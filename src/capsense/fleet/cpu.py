@@ -315,12 +315,14 @@ class CpuCore:
         slope[..., :3] *= UNIT
         slope[..., 3:] *= unit
         slopes = terminals.slope(change, slope) if jacobian else None
-        change = terminals.change(change if loss is None else change - 1j * unit * loss)
+        whole = change if loss is None else change - 1j * unit * loss
+        change = terminals.change(whole)
+        error = terminals.error(unit * found.error, whole, change)
         shields = (terminals.empty + change.real)[..., :n, n:].sum(axis=-1)
         change = change[..., :n, :n]
         omega = 2 * np.pi * solver.excitation_frequency
         return FleetReading(
-            terminals.empty[:n, :n] + change.real, change.real, self._names, unit * found.error,
+            terminals.empty[:n, :n] + change.real, change.real, self._names, error,
             shields,
             conductance=None if loss is None else -omega * change.imag, jacobian=slopes,
             touch=FleetTouch(found.force, solver.length * found.deepest, found.total)

@@ -74,8 +74,8 @@ class Fleet:
     Raises:
         DesignError: The design is wrong.
         SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have.
-        ValueError: There is no such preset, budget or device, or the frequency or a count is not
-            positive.
+        ValueError: There is no such preset, budget or device, the frequency or a count is not
+            positive, or the design's ground is not earthed and the device is one of Warp.
         MissingDependencyError: Warp is requested and not installed.
     """
 
@@ -106,6 +106,11 @@ class Fleet:
         self.count, self.sensors, self.places = count, sensors, len(bodies)
         """How many environments, sensors in each, and places for bodies."""
         self.device = device
+        if device != "cpu" and self.design.ground_capacitance is not None:
+            raise ValueError(
+                f"the ground of design {self.design.name!r} is not earthed, which device "
+                f'{device!r} does not know; take device="cpu", or design.with_grounding("grounded")'
+            )
         field = load_or_build(self.design, default_settings(self.design))
         chosen_preset = PRESETS[preset]
         finer: dict[PresetName, PresetName] = {"fast": "standard", "standard": "fine"}

@@ -85,10 +85,10 @@ class MaskedScenes:
         eps, contact = np.ones(len(scene)), False
         conducts = np.array([b.material.is_conductor(self._excitation_frequency) for b in scene])
         for i, body in enumerate(scene):
-            if not isinstance(body.grounding, str):
+            if body.grounding not in ("grounded", "floating"):
                 raise SceneError(
-                    f"body {body.name or i} is tied to ground through {body.grounding} F; method "
-                    "'fem_masked' knows only grounded and floating bodies"
+                    f"body {body.name or i} has grounding {body.grounding!r}; method 'fem_masked' "
+                    "knows only grounded and floating bodies"
                 )
             if not getattr(body.shape, "closed", True):
                 raise SceneError(

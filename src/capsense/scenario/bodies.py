@@ -17,7 +17,7 @@ from capsense.scenario.model import (
     Trajectory,
 )
 from capsense.scene import Body, Material, Pose, Shape, TriMesh
-from capsense.scene.materials import Grounding, checked_grounding
+from capsense.scene.materials import Grounding, Ties, checked_grounding
 from capsense.scene.surface import read_triangles
 
 if TYPE_CHECKING:
@@ -133,10 +133,16 @@ def read_grounding(table: ScenarioTable, default: Grounding = "grounded") -> Gro
     """What ``grounding`` says.
 
     Raises:
-        ScenarioError: Neither ``"grounded"``, ``"floating"`` nor a capacitance [F].
+        ScenarioError: Neither ``"grounded"``, ``"floating"``, ``"local"``, a capacitance [F], nor
+            a table of ties, ``{ earth = 100e-12, local = 20e-12 }``.
     """
+    value = table.data.get("grounding", default)
     try:
-        return checked_grounding(table.data.get("grounding", default))
+        if isinstance(value, dict):
+            sub = ScenarioTable(value, table.source, f"{table.item}: grounding")
+            sub.only(("earth", "local"))
+            return Ties(**value)
+        return checked_grounding(value)
     except SceneError as error:
         raise table.error(str(error)) from None
 

@@ -284,17 +284,62 @@ GROUND_PATHS: Mapping[str, GroundPath] = MappingProxyType(
 _LARGEST = 1e-3
 """Capacitances to ground beyond this [F] are slips of the pen."""
 
-_Tie = Literal["grounded", "floating"]
-Grounding = _Tie | float
+@dataclass(frozen=True)
+class Ties:
+    """What ties a conductor to earth and to the local ground of the sensor.
+
+    The local ground is that of the sensor's design, see ``Design.with_grounding``; where it is
+    earthed, the two ties are one.
+
+    Raises:
+        SceneError: A number is out of range, or both are 0.
+    """
+
+    earth: float = 0.0
+    """Capacitance to earth [F]."""
+    local: float = 0.0
+    """Capacitance to the local ground [F]; infinite for a link of the same robot, or a person who
+    holds it."""
+
+    def __post_init__(self) -> None:
+        for name, most in (("earth", _LARGEST), ("local", math.inf)):
+            value = as_number(getattr(self, name))
+            if not (0.0 <= value <= _LARGEST or value == most):
+                raise SceneError(
+                    f"ties: {name} is {getattr(self, name)!r} F; give 0 to {_LARGEST:g} F"
+                    + (", or math.inf" if most == math.inf else "")
+                )
+        if self.earth == self.local == 0.0:
+            raise SceneError('ties: both are 0 F; give one, or grounding = "floating"')
+
+
+_Tie = Literal["grounded", "floating", "local"]
+Grounding = _Tie | float | Ties
+
+
+def ties_of(grounding: Grounding) -> Ties:
+    """A grounding as capacitances [F]: infinite to earth for ``"grounded"``; 0 for none."""
+    if isinstance(grounding, Ties):
+        return grounding
+    out = object.__new__(Ties)
+    known = {"grounded": math.inf, "floating": 0.0, "local": 0.0}
+    earth = known[grounding] if isinstance(grounding, str) else grounding
+    out.__dict__.update(earth=earth, local=math.inf if grounding == "local" else 0.0)
+    return out
 
 
 def checked_grounding(grounding: object) -> Grounding:
     """Check a grounding.
 
     Raises:
-        SceneError: Neither one of the two words nor a positive capacitance up to 1 mF.
+        SceneError: Neither one of the words, nor a positive capacitance up to 1 mF, nor ties.
     """
-    fix = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
+    if isinstance(grounding, Ties):
+        return grounding
+    fix = (
+        'give "grounded", "floating", "local", a capacitance to ground in farads, like 100e-12, or '
+        "Ties(earth=…, local=…)"
+    )
     if isinstance(grounding, str):
         if grounding in get_args(_Tie):
             return cast("_Tie", grounding)

@@ -28,8 +28,10 @@ class Body:
         shape: The solid.
         pose: Where it stands in the sensor frame.
         material: A :class:`Material`, or the name of a known one.
-        grounding: ``"grounded"``, ``"floating"``, or the capacitance [F] that ties the body to
-            ground. It matters for conductors only.
+        grounding: ``"grounded"``, that is on earth; ``"floating"``; the capacitance [F] that ties
+            the body to earth; ``"local"``, on the local ground of the sensor, as a link of the
+            same robot; or :class:`~capsense.scene.materials.Ties` to both. It matters for
+            conductors only.
         name: Optional; unique within a scene.
         force: Normal force that presses it onto the cover of a design [N], such as the contact
             force of a simulator; it then decides how deep the body lies in the cover, whatever the

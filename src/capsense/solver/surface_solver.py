@@ -23,6 +23,7 @@ from capsense.field.panels import PLANE_TOL
 from capsense.reading import CapacitanceChange, Charges
 from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import TOUCH, Sheets
+from capsense.scene.materials import ties_of
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.solver.bodies.panels import longer, windowed
@@ -181,6 +182,7 @@ class SurfaceSolver:
         design = metres.in_units if self.length == metres.unit else metres
         self.green = pack_green(green, design)
         self._function = green
+        self._groundless = design.ground_capacitance is not None and not design.local_ground
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain, over ``length``, as :func:`windowed` takes them."""
@@ -330,7 +332,19 @@ class SurfaceSolver:
 
     def matter_of(self, bodies: Sequence[Body]) -> Matter:
         """What bodies are made of, with lengths as kernels take them."""
-        return matter_of(bodies, self.excitation_frequency, self.length)
+        local = self.green.local >= 0
+        matter = matter_of(bodies, self.excitation_frequency, self.length, local=local)
+        if self._groundless and any(ties_of(body.grounding).local > 0.0 for body in bodies):
+            raise SceneError(
+                "a body is tied to the local ground, which floats and has no conductor; give the "
+                'design a [[conductor]] of role = "ground", or the body another grounding'
+            )
+        if matter.local is not None and matter.lossy:
+            raise SceneError(
+                "a body is tied to the local ground, which floats, beside matter with losses; give "
+                "bodies a conductor's or a lossless material, or other groundings"
+            )
+        return matter
 
     def solution(
         self, view: View, *, jacobian: bool = False, time: float | None = None

@@ -15,10 +15,20 @@ from capsense.solver.tree.matter import FLOATING_PENALTY
 
 
 @compiled
-def as_nodes(bodies, near, green):
-    """Make near conductors that are not at ground nodes; their records change to such at ground.
+def any_tied(bodies):
+    """Whether a body is tied to the local ground."""
+    for b in range(bodies.shape[0]):
+        if bodies[b].local_tie > 0.0:
+            return True
+    return False
 
-    Of conductors that touch, all become one node if one of them is near.
+
+@compiled
+def as_nodes(bodies, near, green):
+    """Make conductors nodes that are not at ground and near, or tied to the local ground.
+
+    Their records change to such at ground. Of conductors that touch, all become one node if one of
+    them is one.
 
     Returns:
         How many terminals and nodes there are; the row of each body that is a node, else -1, (b,);
@@ -29,7 +39,8 @@ def as_nodes(bodies, near, green):
     capacitance = np.zeros(count)
     for b in range(count):
         body = bodies[b]
-        if near[b] and (body.neutral != 0 or body.ground_elastance > 0.0) and group[body.group] < 0:
+        free = body.neutral != 0 or body.ground_elastance > 0.0
+        if free and (near[b] or body.local_tie > 0.0) and group[body.group] < 0:
             group[body.group] = green.terminals + nodes
             if body.neutral == 0 and body.ground_elastance < 0.5 * FLOATING_PENALTY:
                 capacitance[nodes] = 1.0 / body.ground_elastance
@@ -40,6 +51,26 @@ def as_nodes(bodies, near, green):
             if node[b] >= 0:
                 bodies[b].neutral, bodies[b].ground_elastance = 0, 0.0
     return green.terminals, nodes, node, capacitance[:nodes]
+
+
+@compiled
+def add_ties(bodies, node, local, matrix):
+    """Add the capacitances of conductors to the local ground to the matrix of terminals and nodes.
+
+    That of a conductor at earth ties the local ground to earth.
+    """
+    for b in range(bodies.shape[0]):
+        tie = bodies[b].local_tie
+        for a in range(b):  # conductors that touch have one tie
+            if bodies[a].group == bodies[b].group:
+                tie = 0.0
+        if tie > 0.0:
+            matrix[local, local] += tie
+            row = node[b]
+            if row >= 0:
+                matrix[row, row] += tie
+                matrix[row, local] -= tie
+                matrix[local, row] -= tie
 
 
 @compiled

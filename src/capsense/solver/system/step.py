@@ -30,6 +30,8 @@ from capsense.solver.placement.placement_kernels import ActiveClusters, leaf_row
 from capsense.solver.placement.truncation_kernels import truncate_to_domain
 from capsense.solver.selection.selection_kernels import ActiveTree, Functions, chosen, functions_of
 from capsense.solver.system.network_kernels import (
+    add_ties,
+    any_tied,
     as_nodes,
     coarse_of,
     congruent,
@@ -222,8 +224,8 @@ def solve_lifted(
 ) -> Solution:
     """As :func:`solve`; of near dielectrics, nothing of what the lift removes is added."""
     near, facing = near_bodies(bodies, green, np.bool_(False)), facing_of(bodies)
-    placed_as, scored, lifted = bodies, bodies, near.copy()
-    if near.any() or facing.pairs > 0:
+    placed_as, scored, lifted, tied = bodies, bodies, near.copy(), any_tied(bodies)
+    if near.any() or facing.pairs > 0 or tied:
         bodies = bodies.copy()  # what follows changes them
         press_out(bodies, near, green)
     if facing.pairs > 0:
@@ -239,9 +241,10 @@ def solve_lifted(
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     weights = np.zeros((m, m))
-    if near.any():
+    if near.any() or tied:
         local_change(bodies, lifted, node, green, delta)
         add_between(placed_as, facing, node, delta)
+        add_ties(bodies, node, green.local, delta)
         weights = potentials_of(delta, m, nodes, capacitance)
         delta, left = congruent(weights, delta, capacitance), congruent(weights, left, np.zeros(0))
         charge, coarse = mixed(charge, weights, green.phi_columns), coarse_of(coarse, weights)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from capsense.constants import UNIT
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
 from capsense.scene.geometry_kernels import parted
-from capsense.scene.materials import Grounding, Material
+from capsense.scene.materials import Grounding, Material, ties_of
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import ShapeKind
 from capsense.solver.tree.dynamic_surface import DynamicBody
@@ -31,6 +31,9 @@ _CONTACT = 6.0
 """Size of a body over that of the contact that ties it to ground."""
 FLOATING_PENALTY = 1e8
 """Energy [1/m] of the net charge of conductors that touch each other and float together."""
+RIGID_TIE = 1e6
+"""Capacitance [m] over 4π eps0 that ties a conductor to the local ground as a wire does: bodies
+have some tenths of their size, and rounding errors stay below a millionth."""
 _UNSEEN = TriMesh | Layers | SurfaceMesh
 """Shapes that are not looked at when it is asked which conductors touch."""
 _ALONG = np.linspace(0.0, 1.0, 33)
@@ -52,6 +55,9 @@ class Matter:
     """First of the conductors that a body touches, directly or not; else itself, shape (n,)."""
     unit: float = 1.0
     """Length unit of what follows from ``ground`` [m]."""
+    local: Array | None = None
+    """Capacitance to the local ground of the sensor [F] over ``unit``, shape (n,); None where no
+    body is tied to it."""
 
     @cached_property
     def conducting(self) -> NDArray[np.bool_]:
@@ -168,6 +174,10 @@ class Matter:
             self.group,
             inverse_susceptibility.real,
         )
+        if self.local is not None:
+            records["local_tie"] = np.where(
+                self.conducting, np.minimum(self.local / UNIT, RIGID_TIE), 0.0
+            )
         records["polarization_stiffness"] = HALF_SPACE * np.abs(inverse_susceptibility)
         for k in np.flatnonzero(inverse_susceptibility).tolist():
             shape = shapes[k]
@@ -179,27 +189,41 @@ class Matter:
                 records["sheet"][k] = shape.sheet
 
 
-def matter_of(bodies: Sequence[Body], frequency: float, unit: float = 1.0) -> Matter:
-    """Look up what bodies are made of, at a frequency [Hz], with lengths in a unit [m]."""
-    return _matter(tuple([(b.material, b.grounding) for b in bodies]), frequency, unit)
+def matter_of(
+    bodies: Sequence[Body], frequency: float, unit: float = 1.0, *, local: bool = False
+) -> Matter:
+    """Look up what bodies are made of, at a frequency [Hz], with lengths in a unit [m].
+
+    ``local`` tells that the sensor has a local ground apart from earth.
+    """
+    return _matter(tuple([(b.material, b.grounding) for b in bodies]), frequency, unit, local)
 
 
 @lru_cache(maxsize=64)
 def _matter(
-    bodies: tuple[tuple[Material, Grounding], ...], frequency: float, unit: float
+    bodies: tuple[tuple[Material, Grounding], ...], frequency: float, unit: float, local: bool
 ) -> Matter:
     eps = np.array([material.complex_permittivity(frequency) for material, _ in bodies], complex)
     eps[np.abs(eps) >= CONDUCTING] = np.inf
-    known = {"grounded": np.inf, "floating": 0.0}
-    ground = [known[tie] if isinstance(tie, str) else tie for _, tie in bodies]
-    return Matter(eps, np.array(ground, float) / unit, np.arange(len(bodies)), unit)
+    ties = [ties_of(grounding) for _, grounding in bodies]
+    earth, own = (np.array([getattr(t, n) for t in ties], float) / unit for n in ("earth", "local"))
+    alone = np.arange(len(bodies))
+    if local and own.any():
+        return Matter(eps, earth, alone, unit, own)
+    return Matter(eps, earth + own, alone, unit)
 
 
 @lru_cache(maxsize=64)
 def _grouped(matter: Matter, group: tuple[int, ...]) -> Matter:
-    total, joint = np.zeros(len(group)), np.array(group)
-    np.add.at(total, joint, matter.ground)
-    return replace(matter, ground=total[joint], group=joint)
+    joint = np.array(group)
+
+    def total(ties: Array) -> Array:
+        out = np.zeros(len(group))
+        np.add.at(out, joint, ties)
+        return out[joint]
+
+    local = None if matter.local is None else total(matter.local)
+    return replace(matter, ground=total(matter.ground), group=joint, local=local)
 
 
 @lru_cache(maxsize=64)
@@ -208,8 +232,9 @@ def _repeated(matter: Matter, places: tuple[int, ...]) -> Matter:
     first: dict[int, int] = {}
     group = [first.setdefault(g, k) for k, g in enumerate(matter.group[at].tolist())]
     return replace(
-        matter, eps=matter.eps[at], ground=matter.ground[at], group=np.array(group, np.int64)
-    )
+        matter, eps=matter.eps[at], ground=matter.ground[at], group=np.array(group, np.int64),
+        local=None if matter.local is None else matter.local[at],
+    )  # fmt: skip
 
 
 def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | DynamicBody]) -> Array:

@@ -72,6 +72,7 @@ BODY = np.dtype(
         ("group", np.int64),  # bodies that touch are one conductor, named by its first body
         # energy of a group's net charge beyond that of its field [1/m]
         ("ground_elastance", np.float64),
+        ("local_tie", np.float64),  # its capacitance to the local ground [m]; 0 for none
         ("inside", np.float64),  # impedance of its inside, over its energy; 0 for a sheet
         ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
         ("inverse_susceptibility", np.float64),  # 1 / (eps - 1), 0 for a conductor
