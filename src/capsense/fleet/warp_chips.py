@@ -67,17 +67,22 @@ class WarpChips:
 
     def _figures(self, readout: Readout, empty: Any) -> Any:
         bank, plan, dac, array = readout.bank, readout.schedule, readout.dac, self._array
-        if bank._with_floating:
-            name = bank.names[bank._with_floating[0]]
+        if bank._with_free:
+            name = bank.names[bank._with_free[0].channel]
             raise ReadoutError(
-                f'channel {name!r} leaves electrodes open, which chips know on device "cpu" only; '
-                'give it rest="grounded" or "guard"'
+                f"channel {name!r} leaves electrodes open, or its transmitter floats, which chips "
+                'know on device "cpu" only; give it rest="grounded" or "guard", and none low'
+            )
+        if len(bank._sense) > len(bank):
+            name = bank.names[bank._channel[len(bank)]]
+            raise ReadoutError(
+                f'channel {name!r} reads several electrodes, which chips know on device "cpu" only'
             )
         out = kernels.ChipFigures()
-        out.sense, out.sign = array(bank._sense, wp.int32), array(bank._sign)
+        out.sense, out.sign = array(bank._sense, wp.int32), array(bank._factor)
         out.volts, out.shield = array(bank._volts), array(bank._shield)
         out.base = array((empty[bank._sense] * bank._volts).sum(axis=1))
-        mixing, offset = readout.wiring.start(np.array([p.is_self for p in bank.patterns]))
+        mixing, offset = readout.wiring.start(np.array([p.sees_ground for p in bank.patterns]))
         out.mixing, out.offset = array(mixing), array(offset)
         instant = np.empty(len(bank))
         instant[plan.order] = plan.offsets

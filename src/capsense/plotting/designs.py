@@ -305,7 +305,7 @@ def plot_chips(
 def _channel_of(readout: Readout, electrode: str) -> int:
     """The first channel that reads an electrode, or drives it."""
     for number, pattern in enumerate(readout.bank.patterns):
-        if electrode == pattern.sense or electrode in pattern.drive:
+        if electrode in pattern.weights or electrode in pattern.drive:
             return number
     raise ReadoutError(
         f"no channel of {readout.name} has the electrode {electrode!r}; channels are "

@@ -1,7 +1,7 @@
 """Channels: which electrodes are driven and read, and what the wiring adds.
 
 A pattern turns a Maxwell matrix into the one capacitance that a channel measures: the charge on the
-electrode read, per volt of the transmitter.
+electrodes read, per volt of the transmitter.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,59 +25,121 @@ RESTS: tuple[Rest, ...] = ("grounded", "floating", "guard")
 
 @dataclass(frozen=True)
 class Pattern:
-    """One measurement: potentials on some electrodes, and the electrode whose charge is read.
+    """One measurement: potentials on some electrodes, and those whose charge is read.
+
+    The value is ``±Σ_s w_s Q_s`` per volt of the transmitter, w being the weights of the electrodes
+    read and Q their charges: plus where one of them is driven, minus where none is, so that self
+    and mutual capacitances are positive.
 
     Raises:
-        ReadoutError: Nothing is driven, a weight is not a finite number, an electrode is both
-            driven and floating, or a receiver other than the transmitter is driven.
+        ReadoutError: Nothing is driven or read, a weight is not a finite number, an electrode has
+            two roles, or a floating transmitter is given a guard or a shield.
     """
 
-    sense: str
-    """Electrode whose charge is measured."""
+    sense: str | Sequence[str] | Mapping[str, float]
+    """Electrode whose charge is measured; several that are joined; or several with the weights of
+    their charges."""
     drive: Mapping[str, float] = field(default_factory=dict)
-    """Potential of each driven electrode in units of the transmitter's, such as 1 or −1; empty
-    for the electrode read itself: a self measurement."""
+    """Potential of each driven electrode in units of the transmitter's, such as 1 or −1, or 0 for
+    one that is held at ground; empty for those read, at 1: a self measurement."""
     floating: tuple[str, ...] = ()
     """Electrodes left open: they carry no charge and take the potential that follows."""
     rest: Rest = "grounded"
     """What electrodes named nowhere do; ``"guard"`` drives them at the transmitter's potential."""
     shield: float = 0.0
-    """Potential of the design's driven shields in units of the transmitter's."""
+    """Potential of the design's driven shields in units of the transmitter's: 1 in phase, −1 out
+    of phase."""
     name: str = ""
     """Channel name; by default that of the electrodes."""
+    low: tuple[str, ...] = ()
+    """Electrodes on the other end of a transmitter that floats, as that of an LCR meter does: they
+    and the driven ones carry no charge together. Empty where the transmitter is at ground."""
+    minus: str | Pattern | None = None
+    """A measurement whose value is subtracted, or the electrode of which the same is measured."""
 
     def __post_init__(self) -> None:
-        drive = dict(self.drive) or {self.sense: 1.0}
-        label = self.name or _default_name(self.sense, drive)
+        sense = self._weights_of_sense()
+        if isinstance(self.low, str):
+            object.__setattr__(self, "low", (self.low,))
+        drive = dict(self.drive) or dict.fromkeys(sense, 1.0)
+        label = self.name or self._default_name(sense, drive)
         where = f"channel {label!r}"
-        for electrode, weight in (*drive.items(), ("shield", self.shield)):
-            require(where, f"the drive of {electrode!r}", weight, -math.inf, "")
+        weights = (("drive", {**drive, "shield": self.shield}), ("weight", sense))
+        for what, given in weights:
+            for electrode, weight in given.items():
+                require(where, f"the {what} of {electrode!r}", weight, -math.inf, "")
         if all(weight == 0.0 for weight in drive.values()):
             raise ReadoutError(f"{where}: nothing is driven; give one electrode a weight")
+        if all(weight == 0.0 for weight in sense.values()):
+            raise ReadoutError(f"{where}: nothing is read; give one electrode a weight")
         if self.rest not in RESTS:
             raise ReadoutError(f"{where}: rest = {self.rest!r}; {suggest(str(self.rest), RESTS)}")
         for electrode in self.floating:
-            if electrode in drive or electrode == self.sense:
+            if electrode in drive or electrode in sense or electrode in self.low:
                 raise ReadoutError(
                     f"{where}: electrode {electrode!r} is floating, and driven or read; keep one"
                 )
-        if self.sense in drive and len(drive) > 1:
+        for electrode in self.low:
+            if electrode in drive:
+                raise ReadoutError(f"{where}: electrode {electrode!r} is driven and low; keep one")
+        if self.low and (self.rest == "guard" or self.shield != 0.0):
             raise ReadoutError(
-                f"{where}: {self.sense!r} is read and driven together with other electrodes; "
-                'read it alone, with the others as rest = "guard"'
+                f"{where}: the transmitter floats between {', '.join(drive)} and "
+                f"{', '.join(self.low)}, so that no guard and no shield is at its potential; give "
+                'rest = "grounded" or "floating", and shield = 0'
             )
         object.__setattr__(self, "drive", MappingProxyType(drive))
+        if not isinstance(self.sense, str):
+            object.__setattr__(self, "sense", MappingProxyType(sense))
         object.__setattr__(self, "name", label)
+        object.__setattr__(self, "minus", self._subtracted(where))
+
+    def _weights_of_sense(self) -> dict[str, float]:
+        if isinstance(self.sense, str):
+            return {self.sense: 1.0}
+        if isinstance(self.sense, Mapping):
+            return dict(self.sense)
+        return dict.fromkeys(self.sense, 1.0)
+
+    def _subtracted(self, where: str) -> Pattern | None:
+        """The measurement that is subtracted, from what was given."""
+        if self.minus is None or isinstance(self.minus, Pattern):
+            if self.minus is not None and self.minus.minus is not None:
+                raise ReadoutError(
+                    f"{where}: what is subtracted is a difference itself; give one of two patterns"
+                )
+            return self.minus
+        sense = self._weights_of_sense()
+        if dict(self.drive) != dict.fromkeys(sense, 1.0):
+            raise ReadoutError(
+                f"{where}: minus = {self.minus!r} names an electrode, which goes with a self "
+                "measurement; give a Pattern"
+            )
+        if self.minus in sense:
+            raise ReadoutError(f"{where}: {self.minus!r} is read and subtracted; give another one")
+        return Pattern(self.minus, {}, self.floating, self.rest, self.shield, "", self.low)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only mapping is neither copied nor pickled by itself.
-        figures = (self.floating, self.rest, self.shield, self.name)
-        return type(self), (self.sense, dict(self.drive), *figures)
+        sense = self.sense if isinstance(self.sense, str) else dict(self.sense)
+        figures = (self.floating, self.rest, self.shield, self.name, self.low, self.minus)
+        return type(self), (sense, dict(self.drive), *figures)
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """Electrodes that are read, and the weights of their charges."""
+        return MappingProxyType(self._weights_of_sense())
 
     @property
     def is_self(self) -> bool:
-        """Whether the electrode read is the one driven."""
-        return self.sense in self.drive
+        """Whether an electrode that is read is driven."""
+        return any(self.drive.get(name, 0.0) != 0.0 for name in self.weights)
+
+    @property
+    def sees_ground(self) -> bool:
+        """Whether it charges what its leads have to ground: not a mutual one, nor one whose
+        transmitter floats, nor a difference, of which equal leads cancel."""
+        return self.is_self and not self.low and self.minus is None
 
     @property
     def excitation(self) -> Hashable:
@@ -86,15 +148,20 @@ class Pattern:
         Receivers are held at ground, as the rest is. Where the rest floats or is driven, what
         another pattern reads would have to float or be driven: such a pattern is measured alone.
         """
-        alone = "" if self.rest == "grounded" else self.name
+        plain = self.rest == "grounded" and not self.low and self.minus is None
         driven = frozenset(self.drive.items())
-        return driven, frozenset(self.floating), self.shield, alone
+        return driven, frozenset(self.floating), self.shield, "" if plain else self.name
 
-
-def _default_name(sense: str, drive: Mapping[str, float]) -> str:
-    if sense in drive:
-        return sense
-    return "+".join(drive) + f"-{sense}"
+    def _default_name(self, sense: Mapping[str, float], drive: Mapping[str, float]) -> str:
+        out = "+".join(sense)
+        if set(drive) != set(sense):
+            out = "+".join(drive) + f"-{out}"
+        if self.low:
+            out += f" to {'+'.join(self.low)}"
+        if self.minus is not None:
+            other = self.minus if isinstance(self.minus, str) else self.minus.name
+            out += f" minus {other}"
+        return out
 
 
 def self_patterns(
@@ -112,13 +179,62 @@ def mutual_patterns(
     Raises:
         ReadoutError: A pair names one electrode twice.
     """
+    return tuple(Pattern(rx, {tx: 1.0}, rest=rest) for tx, rx in _pairs(electrodes, pairs))
+
+
+def differential_patterns(
+    electrodes: Sequence[str], pairs: Iterable[tuple[str, str]] = (), *,
+    rest: Rest = "grounded", shield: float = 1.0,
+) -> tuple[Pattern, ...]:  # fmt: skip
+    """Self measurements of the first of each pair minus those of the second; by default of all.
+
+    So measures an FDC1004 with CHA − CHB: it drives the two and their shields in antiphase, and
+    each pair's mutual capacitance cancels.
+
+    Raises:
+        ReadoutError: A pair names one electrode twice.
+    """
+    return tuple(
+        Pattern(one, rest=rest, shield=shield, minus=two) for one, two in _pairs(electrodes, pairs)
+    )
+
+
+def two_terminal_patterns(
+    electrodes: Sequence[str], pairs: Iterable[tuple[str, str]] = (), *, rest: Rest = "grounded"
+) -> tuple[Pattern, ...]:
+    """What an LCR meter that floats reads between the two of each pair; by default of all.
+
+    With the others at ground, ``(C₁₁ C₂₂ − C₁₂²)/(C₁₁ + C₂₂ + 2 C₁₂)``.
+
+    Raises:
+        ReadoutError: A pair names one electrode twice.
+    """
+    return tuple(Pattern(one, low=(two,), rest=rest) for one, two in _pairs(electrodes, pairs))
+
+
+def _pairs(
+    electrodes: Sequence[str], pairs: Iterable[tuple[str, str]]
+) -> list[tuple[str, str]]:
     chosen = list(pairs) or [
         (one, two) for k, one in enumerate(electrodes) for two in electrodes[k + 1 :]
     ]
-    for tx, rx in chosen:
-        if tx == rx:
-            raise ReadoutError(f"pair {[tx, rx]} names one electrode twice; give two")
-    return tuple(Pattern(rx, {tx: 1.0}, rest=rest) for tx, rx in chosen)
+    for one, two in chosen:
+        if one == two:
+            raise ReadoutError(f"pair {[one, two]} names one electrode twice; give two")
+    return chosen
+
+
+class _Part(NamedTuple):
+    """One of the measurements whose values make a channel's."""
+
+    channel: int
+    factor: Array
+    """What the charge of each electrode counts for in the value, shape (M,)."""
+    volts: Array
+    """Potentials of the electrodes, of free ones before they rise, shape (M,)."""
+    shield: float
+    free: tuple[NDArray[np.int64], ...]
+    """Electrodes that rise together until they carry no charge."""
 
 
 class ChannelBank:
@@ -149,29 +265,39 @@ class ChannelBank:
             if self.names.count(name) > 1:
                 raise ReadoutError(f"two channels are named {name!r}; give them names")
         index = {name: k for k, name in enumerate(self.electrodes)}
-        for pattern in self.patterns:
-            for name in (pattern.sense, *pattern.drive, *pattern.floating):
-                if name not in index:
-                    raise ReadoutError(
-                        f"channel {pattern.name!r} names no electrode {name!r} of the sensor; "
-                        f"{suggest(name, self.electrodes)}"
-                    )
-        self._sense = np.array([index[p.sense] for p in self.patterns])
-        self._sign = np.array([1.0 if p.is_self else -1.0 for p in self.patterns])
-        self._volts = np.array([self._potentials(p, index) for p in self.patterns])
-        self._shield = np.array([p.shield for p in self.patterns])
-        self._open = [self._floating_of(p, index) for p in self.patterns]
-        self._with_floating = [k for k, f in enumerate(self._open) if len(f)]
+        self._parts: list[_Part] = []
+        for k, pattern in enumerate(self.patterns):
+            self._parts.append(_part(pattern, k, 1.0, index))
+            if isinstance(pattern.minus, Pattern):
+                self._parts.append(_part(pattern.minus, k, -1.0, index))
+        first: list[tuple[_Part, int]] = []  # charges that are read, one of each channel
+        further: list[tuple[_Part, int]] = []
+        for part in self._parts:
+            for s in np.flatnonzero(part.factor).tolist():
+                (first if len(first) == part.channel else further).append((part, s))
+        terms = first + further
+        self._channel = np.array([part.channel for part, _ in terms])
+        self._sense = np.array([s for _, s in terms])
+        self._factor = np.array([part.factor[s] for part, s in terms])
+        self._volts = np.array([part.volts for part, _ in terms])
+        self._shield = np.array([part.shield for part, _ in terms])
+        self._with_free = [part for part in self._parts if part.free]
 
     def __len__(self) -> int:
         return len(self.patterns)
 
+    @property
+    def differences(self) -> NDArray[np.bool_]:
+        """Which channels are differences of two measurements, shape (K,)."""
+        return np.array([p.minus is not None for p in self.patterns])
+
     def values(self, capacitance: Array, shield_coupling: Array | None = None) -> Array:
         """Capacitance of every channel.
 
-        A channel's value is ``±Σ_j C[sense, j] v_j``: plus for a self measurement, minus for a
-        mutual one, so that both are positive. Open electrodes first get the potentials at which
-        they carry no charge, ``v_f = −C_ff⁻¹ (C_fd v_d)``.
+        A channel's value is ``±Σ_s w_s Σ_j C_sj v_j``: plus for a self measurement, minus for a
+        mutual one, so that both are positive. Electrodes that are free to rise first get the
+        potentials at which they carry no charge: open ones each by itself, and those between which
+        a transmitter floats together, ``u = −(Nᵀ C N)⁻¹ Nᵀ C v``, with a column of N for each.
 
         Args:
             capacitance: Maxwell matrices [F], shields at ground, shape (..., M, M); complex ones
@@ -192,47 +318,67 @@ class ChannelBank:
                 f"capacitance has shape {matrix.shape}; {m} electrodes need (..., {m}, {m})"
             )
         rows = matrix[..., self._sense, :]
-        out = (rows * self._volts).sum(axis=-1)
+        terms = (rows * self._volts).sum(axis=-1)
         if shield_coupling is not None:
-            out = out + np.asarray(shield_coupling)[..., self._sense] * self._shield
-        for k in self._with_floating:
-            out[..., k] += self._induced(matrix, shield_coupling, k)
-        out = self._sign * out
+            terms = terms + np.asarray(shield_coupling)[..., self._sense] * self._shield
+        terms = self._factor * terms
+        out = terms[..., : len(self)]
+        for number in range(len(self), len(self._channel)):
+            out[..., self._channel[number]] += terms[..., number]
+        for part in self._with_free:
+            out[..., part.channel] += self._induced(matrix, shield_coupling, part)
         if not np.isfinite(out).all():
             raise ReadoutError(
                 "capacitance holds a number that is not finite; correct the readings"
             )
         return out
 
-    def _induced(self, matrix: Array, coupling: Array | None, k: int) -> Array:
-        """Charge on the electrode read that the potentials of open electrodes add."""
-        open_ = self._open[k]
-        charge = (matrix[..., open_, :] * self._volts[k]).sum(axis=-1)
+    def _induced(self, matrix: Array, coupling: Array | None, part: _Part) -> Array:
+        """What the potentials of free electrodes add to a channel [F]."""
+        charge = (matrix * part.volts).sum(axis=-1)
         if coupling is not None:
-            charge = charge + np.asarray(coupling)[..., open_] * self._shield[k]
-        own = matrix[..., open_[:, None], open_]
+            charge = charge + np.asarray(coupling) * part.shield
+        lift = np.stack([matrix[..., group].sum(axis=-1) for group in part.free], axis=-1)
+        own = np.stack([lift[..., group, :].sum(axis=-2) for group in part.free], axis=-2)
+        side = np.stack([charge[..., group].sum(axis=-1) for group in part.free], axis=-1)
         try:
-            volts = -np.linalg.solve(own, charge[..., None])[..., 0]
+            volts = -np.linalg.solve(own, side[..., None])[..., 0]
         except np.linalg.LinAlgError:
             raise ReadoutError(
-                f"channel {self.names[k]!r}: its open electrodes have no capacitance; correct the "
-                "readings"
+                f"channel {self.names[part.channel]!r}: its open electrodes have no capacitance; "
+                "correct the readings"
             ) from None
-        return (matrix[..., self._sense[k], open_] * volts).sum(axis=-1)
+        raised = (lift * volts[..., None, :]).sum(axis=-1)
+        return (raised * part.factor).sum(axis=-1)
 
-    def _potentials(self, pattern: Pattern, index: Mapping[str, int]) -> Array:
-        volts = np.full(len(self.electrodes), 1.0 if pattern.rest == "guard" else 0.0)
-        volts[[index[f] for f in pattern.floating]] = 0.0
-        volts[index[pattern.sense]] = 0.0
-        for name, weight in pattern.drive.items():
-            volts[index[name]] = weight
-        return volts
 
-    def _floating_of(self, pattern: Pattern, index: Mapping[str, int]) -> NDArray[np.int64]:
-        names = set(pattern.floating)
-        if pattern.rest == "floating":
-            names = set(self.electrodes) - {pattern.sense, *pattern.drive}
-        return np.array(sorted(index[n] for n in names), dtype=np.int64)
+def _part(pattern: Pattern, channel: int, sign: float, index: Mapping[str, int]) -> _Part:
+    """A pattern, without what it subtracts, by the numbers of the electrodes.
+
+    Raises:
+        ReadoutError: It names an electrode that is not there.
+    """
+    sense = pattern.weights
+    for name in (*sense, *pattern.drive, *pattern.floating, *pattern.low):
+        if name not in index:
+            raise ReadoutError(
+                f"channel {pattern.name!r} names no electrode {name!r} of the sensor; "
+                f"{suggest(name, list(index))}"
+            )
+    held = {**dict.fromkeys((*sense, *pattern.low, *pattern.floating), 0.0), **pattern.drive}
+    volts = np.full(len(index), 1.0 if pattern.rest == "guard" else 0.0)
+    volts[[index[name] for name in held]] = list(held.values())
+    factor = np.zeros(len(index))
+    sign = sign if pattern.is_self else -sign
+    factor[[index[name] for name in sense]] = [sign * weight for weight in sense.values()]
+    opened = set(pattern.floating)
+    if pattern.rest == "floating":
+        opened = set(index) - {*sense, *pattern.drive, *pattern.low}
+    free = [[number] for number in sorted(index[name] for name in opened)]
+    if pattern.low:
+        free.append(sorted(index[name] for name in (*pattern.drive, *pattern.low)))
+    groups = tuple(np.array(group, dtype=np.int64) for group in free)
+    return _Part(channel, factor, volts, pattern.shield, groups)
 
 
 @dataclass(frozen=True)
@@ -280,7 +426,7 @@ class Wiring:
         """Mixing matrix and offsets of channels.
 
         Args:
-            is_self: Which channels are self measurements, shape (K,).
+            is_self: Which channels charge what their leads have to ground, shape (K,).
 
         Returns:
             The matrix, shape (K, K), and offsets [F], shape (K,).

@@ -12,7 +12,16 @@ from capsense import _validate
 from capsense._validate import read_toml, suggest
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
-from capsense.readout.channels import RESTS, Pattern, Rest, Wiring, mutual_patterns, self_patterns
+from capsense.readout.channels import (
+    RESTS,
+    Pattern,
+    Rest,
+    Wiring,
+    differential_patterns,
+    mutual_patterns,
+    self_patterns,
+    two_terminal_patterns,
+)
 from capsense.readout.converter import Detector, ExponentialTracker, SteppingTracker, Tracker
 from capsense.readout.laws import Law, ResonanceLaw, ShuntLaw
 from capsense.readout.presets import CHIPS, Chip, ReadoutOptions, chip_of, expected_of
@@ -205,37 +214,66 @@ def _patterns(top: ReadoutTable, mode: str, electrodes: Sequence[str]) -> tuple[
             _pattern(ReadoutTable(raw, top.source, f"channel {number}"), electrodes)
             for number, raw in enumerate(top.tables("channel"), start=1)
         )
-    mode = top.choice("mode", ("self", "mutual"), mode)
+    mode = top.choice("mode", ("self", *_OF_PAIRS), mode)
     rest = cast("Rest", top.choice("rest", RESTS, "grounded"))
     if mode == "self":
         if "pairs" in top:
-            raise top.error('pairs is for mode = "mutual"; remove one')
+            raise top.error(f"pairs is for mode = {', '.join(map(repr, _OF_PAIRS))}; remove one")
         return self_patterns(electrodes, rest=rest)
-    what = 'a list of [transmitter, receiver] names, like [["E1", "E2"]]'
+    what = 'a list of pairs of electrode names, like [["E1", "E2"]]'
     pairs = top.pairs("pairs", what, electrodes, "the sensor")
     with top.named():
-        return mutual_patterns(electrodes, pairs, rest=rest)
+        return _OF_PAIRS[mode](electrodes, pairs, rest=rest)
+
+
+_OF_PAIRS = {
+    "mutual": mutual_patterns, "differential": differential_patterns,
+    "two-terminal": two_terminal_patterns,
+}  # fmt: skip
+"""Modes that measure pairs of electrodes → what makes their patterns."""
 
 
 def _pattern(table: ReadoutTable, electrodes: Sequence[str]) -> Pattern:
-    table.only(("name", "sense", "drive", "floating", "rest", "shield"))
-    sense = table.string("sense")
-    _require_electrode(table, "sense", sense, electrodes)
-    drive_table = ReadoutTable(table.data.get("drive", {}), table.source, f"{table.item}: drive")
-    drive = {}
-    for name in drive_table.data:
-        _require_electrode(table, "drive", name, electrodes)
-        drive[name] = drive_table.number(name, -1e3, 1e3)
-    floating = table.data.get("floating", [])
-    if not isinstance(floating, list) or not all(isinstance(n, str) for n in floating):
-        raise table.error(f"floating = {floating!r} must be a list of electrode names")
-    for name in floating:
-        _require_electrode(table, "floating", name, electrodes)
+    table.only(("name", "sense", "drive", "floating", "rest", "shield", "low", "minus"))
+    sense: Any = table.raw("sense", 'an electrode, "E1", several, ["E1", "E2"], or their weights')
+    if isinstance(sense, dict):
+        sense = _weights(table, "sense", electrodes)
+    elif isinstance(sense, list):
+        sense = _names(table, "sense", electrodes)
+    else:
+        sense = table.string("sense")
+        _require_electrode(table, "sense", sense, electrodes)
+    drive, low = _weights(table, "drive", electrodes), _names(table, "low", electrodes)
     rest = cast("Rest", table.choice("rest", RESTS, "grounded"))
-    shield = table.number("shield", -1e3, 1e3, 0.0 if drive else 1.0)
-    name = table.text("name")
+    shield = table.number("shield", -1e3, 1e3, 0.0 if drive or low else 1.0)
+    minus: Any = table.data.get("minus")
+    if isinstance(minus, dict):
+        sub = ReadoutTable(minus, table.source, f"{table.item}: minus")
+        minus = _pattern(sub, electrodes)
+    elif minus is not None:
+        minus = table.string("minus")
+        _require_electrode(table, "minus", minus, electrodes)
+    floating, name = _names(table, "floating", electrodes), table.text("name")
     with table.named():
-        return Pattern(sense, drive, tuple(floating), rest, shield, name)
+        return Pattern(sense, drive, floating, rest, shield, name, low, minus)
+
+
+def _weights(table: ReadoutTable, key: str, electrodes: Sequence[str]) -> dict[str, float]:
+    """Numbers by the names of electrodes; none where there is no such key."""
+    sub = ReadoutTable(table.data.get(key, {}), table.source, f"{table.item}: {key}")
+    for name in sub.data:
+        _require_electrode(table, key, name, electrodes)
+    return {name: sub.number(name, -1e3, 1e3) for name in sub.data}
+
+
+def _names(table: ReadoutTable, key: str, electrodes: Sequence[str]) -> tuple[str, ...]:
+    """Names of electrodes; none where there is no such key."""
+    names = table.data.get(key, [])
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise table.error(f"{key} = {names!r} must be a list of electrode names")
+    for name in names:
+        _require_electrode(table, key, name, electrodes)
+    return tuple(names)
 
 
 def _require_electrode(table: ReadoutTable, key: str, name: str, electrodes: Sequence[str]) -> None:

@@ -94,7 +94,8 @@ class Readout:
         self.schedule, self.law, self.dac = schedule, law, dac
         self.stages, self.detector = tuple(stages), detector
         self.wiring = wiring or Wiring()
-        mixing, self._offset = self.wiring.start(np.array([p.is_self for p in self.bank.patterns]))
+        grounds = np.array([p.sees_ground for p in self.bank.patterns])
+        mixing, self._offset = self.wiring.start(grounds)
         self._mixing = None if np.array_equal(mixing, np.eye(len(self.bank))) else mixing
         self.reset(seed=seed)
 

@@ -81,7 +81,8 @@ class CapacitanceRecord:
         return bank.values(matrix, coupling)
 
     def _simple(self, columns: Mapping[str, ArrayLike], pattern: Pattern) -> Array:
-        plain = not pattern.floating and pattern.rest == "grounded"
+        plain = not (pattern.floating or pattern.low or pattern.minus)
+        plain = plain and pattern.rest == "grounded" and isinstance(pattern.sense, str)
         if plain and len(pattern.drive) == 1:
             ((driven, weight),) = pattern.drive.items()
             names = [f"C_{pattern.sense}"]
