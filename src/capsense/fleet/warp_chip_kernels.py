@@ -54,7 +54,7 @@ class ChipFigures:
     lag: wp.float64
     slack: wp.float64
     law: WarpLaw
-    actual: wp.array(dtype=wp.float64)  # what the offset DAC subtracts [F], (codes,); empty: none
+    codes: wp.int32  # of the offset DAC; 0: none
     step: wp.float64  # what its user takes for one step [F]
     follow: wp.int32
     stride: wp.int32
@@ -77,6 +77,7 @@ class State:
     told: wp.array2d(dtype=wp.int32)  # and that can be read
     random: wp.array2d(dtype=wp.uint32)
     dac: wp.array2d(dtype=wp.int32)  # -1 where it is not set
+    bits: wp.array3d(dtype=wp.float64)  # what bits of the offset DAC have too much [F], (b, K, c)
     poles: wp.array3d(dtype=wp.float64)  # (p, K, c)
     waiting: wp.array3d(dtype=wp.vec2d)  # codes and capacitances that cannot be read yet, (d, K, c)
 
@@ -222,12 +223,16 @@ def _converted(chip: ChipFigures, state: State, k: int, c: int, value: wp.float6
     """Code and capacitance of a value, as ``Conversion``."""
     used = int(0)
     inside = value
-    codes = chip.actual.shape[0]
+    codes = chip.codes
     if codes > 0:
         used = state.dac[k, c]
         if used < 0:
             used = wp.clamp(int(wp.rint(value / chip.step)), 0, codes - 1)
-        inside = value - chip.actual[used]
+        wrong = wp.float64(0.0)
+        for bit in range(state.bits.shape[0]):
+            if ((used >> bit) & 1) == 1:
+                wrong += state.bits[bit, k, c]
+        inside = value - (wp.float64(used) * chip.step + wrong)
     level = wp.rint(_level(chip.law, inside))
     code = wp.clamp(level, chip.law.low, chip.law.high)
     reported = _capacitance(chip.law, code) + wp.float64(used) * chip.step

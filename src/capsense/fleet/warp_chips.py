@@ -19,6 +19,7 @@ from capsense.fleet.bodies import on_device
 from capsense.readout import Readout
 from capsense.readout.conversions import Held
 from capsense.readout.noise import ClimateDrift, Context, Flicker, Mains, RandomWalk, White
+from capsense.readout.readout import specimen_rng
 
 
 class WarpChips:
@@ -55,6 +56,11 @@ class WarpChips:
         state.random = self._array(states, wp.uint32)
         dac = readout.dac
         state.dac.fill_(-1 if dac is None or dac.start == "auto" else dac.start)
+        state.bits = room(0, k, chips)
+        if dac is not None:
+            number = seed if readout.specimen is None else readout.specimen
+            errors = dac.specimens(k, specimen_rng(number), chips)
+            state.bits = self._array(errors.reshape(chips, k, -1).transpose(2, 1, 0))
         state.waiting = room(math.ceil(plan.lag / plan.period) + 2, k, chips, dtype=wp.vec2d)
         self._set_stages(readout, k, chips, state)
         self._state = state
@@ -73,8 +79,8 @@ class WarpChips:
                 f"channel {name!r} leaves electrodes open, or its transmitter floats, which chips "
                 'know on device "cpu" only; give it rest="grounded" or "guard", and none low'
             )
-        if len(bank._sense) > len(bank):
-            name = bank.names[bank._channel[len(bank)]]
+        if bank.differences.any() or len(bank._sense) > len(bank):
+            name = bank.names[bank._channel[-1]]
             raise ReadoutError(
                 f'channel {name!r} reads several electrodes, which chips know on device "cpu" only'
             )
@@ -90,10 +96,8 @@ class WarpChips:
         out.lag, out.slack = plan.lag, plan.slack
         out.law = kernels.law_of(readout.law)
         if dac is not None:
-            out.actual, out.step, out.follow = array(dac.actual()), dac.step, int(dac.follow)
+            out.codes, out.step, out.follow = dac.codes, dac.step, int(dac.follow)
             out.stride = dac.stride(readout.law)
-        else:
-            out.actual = array(np.zeros(0))
         return out
 
     def _set_stages(self, readout: Readout, k: int, chips: int, state: Any) -> None:

@@ -30,7 +30,7 @@ from capsense.readout.readout import ReadingLike, Readout, build
 TOP_KEYS = (
     "chip", "rate", "period", "latency", "seed", "random", "expected", "capdac", "mode", "pairs",
     "rest", "channel", "tank", "front_end", "wiring", "noise", "climate", "detector", "calibration",
-    "nonlinearity",
+    "nonlinearity", "capdac_errors", "specimen",
 )  # fmt: skip
 
 
@@ -147,6 +147,10 @@ def parse_readout(
     options.update(_given(top, limits))
     if "capdac" in top:
         options["capdac"] = top.integer("capdac", 0, 10**6)
+    if "capdac_errors" in top:
+        options["capdac_errors"] = _numbers(top, "capdac_errors")
+    if "specimen" in top:
+        options["specimen"] = top.integer("specimen", 0, 2**63 - 1)
     options["seed"] = top.integer("seed", 0, 2**63 - 1, 0)
     options["noise"] = top.boolean("random", True)
     if "tank" in top or "front_end" in top:
@@ -256,6 +260,14 @@ def _pattern(table: ReadoutTable, electrodes: Sequence[str]) -> Pattern:
     floating, name = _names(table, "floating", electrodes), table.text("name")
     with table.named():
         return Pattern(sense, drive, floating, rest, shield, name, low, minus)
+
+
+def _numbers(table: ReadoutTable, key: str) -> list[float]:
+    """A list of capacitances [F]."""
+    given = table.series(key, -1e-9, 1e-9, "F")
+    if not isinstance(given, list):
+        raise table.error(f"{key} = {given!r} must be a list, one number a bit")
+    return given
 
 
 def _weights(table: ReadoutTable, key: str, electrodes: Sequence[str]) -> dict[str, float]:

@@ -320,8 +320,9 @@ def join(parts: Sequence[Counts]) -> Counts:
 class _Columns:
     """Stands for the channels of all chips: there is nothing to pick from a matrix any more."""
 
-    def __init__(self, count: int) -> None:
-        self.names = tuple(map(str, range(count)))
+    def __init__(self, differences: NDArray[np.bool_], count: int) -> None:
+        self.differences = np.tile(differences, count)
+        self.names = tuple(map(str, range(len(self.differences))))
 
     def __len__(self) -> int:
         return len(self.names)

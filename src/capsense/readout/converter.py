@@ -39,7 +39,9 @@ class CapDac:
     """A capacitor array in the chip that is subtracted from the input, in steps.
 
     The chip's user adds ``code · step`` to the result. Where the capacitors of the bits differ
-    from that, the sum jumps when the code changes.
+    from that, the sum jumps when the code changes. They differ from specimen to specimen: that of
+    bit b has too much by ``bit_errors[b] + step 2^b (tolerance u + mismatch g_b)``, with u even
+    from −1 to 1 for the whole array and normal g_b for each bit.
     """
 
     step: float
@@ -48,6 +50,14 @@ class CapDac:
     """Number of codes, from 0."""
     bit_errors: tuple[float, ...] = ()
     """What each bit's capacitor has too much [F], the least significant first."""
+    mismatch: float = 0.0
+    """Standard deviation of a bit's capacitor over its nominal value, from specimen to specimen."""
+    tolerance: float = 0.0
+    """Largest deviation of the whole array over its nominal value, from specimen to specimen."""
+    channels: int | None = None
+    """Channels that one array serves, the first ones by the first; None for all."""
+    differential: bool = True
+    """Whether it works in differential measurements too."""
     start: int | Literal["auto"] = "auto"
     """Code at the start; ``"auto"`` takes that nearest to each channel's first sample."""
     follow: bool = True
@@ -60,12 +70,42 @@ class CapDac:
             require_whole("CAPDAC", 'start (if not "auto")', self.start, 0, self.codes - 1)
         for error in self.bit_errors:
             require("CAPDAC", "bit_errors", error, -math.inf, "F")
+        if len(self.bit_errors) > self.bits:
+            raise ReadoutError(
+                f"CAPDAC: bit_errors are {len(self.bit_errors)}, but {self.codes} codes have "
+                f"{self.bits} bits; give one a bit, the least significant first"
+            )
+        for name in ("mismatch", "tolerance"):
+            require("CAPDAC", name, getattr(self, name), 0.0, "")
 
-    def actual(self) -> Array:
-        """What is subtracted at each code [F], shape (codes,)."""
-        code = np.arange(self.codes)
-        errors = sum(error * ((code >> bit) & 1) for bit, error in enumerate(self.bit_errors))
-        return np.asarray(code * self.step + errors, dtype=float)
+    @property
+    def bits(self) -> int:
+        """Bits of its codes."""
+        return (self.codes - 1).bit_length()
+
+    def specimens(self, channels: int, rng: np.random.Generator, sensors: int = 1) -> Array:
+        """What the capacitors of new specimens have too much, for each channel that they serve.
+
+        Args:
+            channels: Number of channels of one sensor.
+            rng: Draws the specimens.
+            sensors: How many sensors, each with specimens of its own.
+
+        Returns:
+            Of each bit [F], shape (sensors · channels, bits).
+        """
+        served = self.channels or channels
+        arrays = -(-channels // served)
+        common = self.tolerance * rng.uniform(-1.0, 1.0, (sensors, arrays, 1))
+        own = common + self.mismatch * rng.standard_normal((sensors, arrays, self.bits))
+        errors = own * self.step * 2.0 ** np.arange(self.bits)
+        errors[..., : len(self.bit_errors)] += self.bit_errors
+        return np.repeat(errors, served, axis=1)[:, :channels].reshape(-1, self.bits)
+
+    def actual(self, code: Ints, errors: Array) -> Array:
+        """What is subtracted at codes [F], shape (n,), by capacitors with errors [F], (n, bits)."""
+        on = (code[:, None] >> np.arange(self.bits)) & 1
+        return np.asarray(code * self.step + (on * errors).sum(axis=1), dtype=float)
 
     def nearest(self, capacitance: Array) -> Ints:
         """Code nominally nearest to capacitances [F]."""
@@ -84,13 +124,24 @@ class Conversion:
         law: How code and capacitance belong together.
         dac: The offset DAC, if it has one.
         channels: Number of channels.
+        errors: What the DAC's capacitors have too much [F], as of :meth:`CapDac.specimens`, shape
+            (channels, bits); by default its ``bit_errors``.
+        without: Channels that are converted without the DAC, shape (channels,); none by default.
     """
 
-    def __init__(self, law: Law, dac: CapDac | None, channels: int) -> None:
+    def __init__(
+        self, law: Law, dac: CapDac | None, channels: int, errors: Array | None = None,
+        without: Bools | None = None,
+    ) -> None:  # fmt: skip
         self._law, self._dac, self._channels = law, dac, channels
         if dac is not None:
-            self._actual = dac.actual()
-            self.dac_codes = np.full(channels, -1 if dac.start == "auto" else dac.start)
+            if errors is None:
+                errors = np.zeros((channels, dac.bits))
+                errors[:, : len(dac.bit_errors)] = dac.bit_errors
+            self._errors = errors
+            self._with = np.ones(channels, bool) if without is None else ~without
+            start = -1 if dac.start == "auto" else dac.start
+            self.dac_codes = np.where(self._with, start, 0)
 
     def __call__(self, channel: Ints, value: Array) -> tuple[Ints, Array, Flags]:
         """Convert a batch.
@@ -123,8 +174,8 @@ class Conversion:
         used = self.dac_codes[channel]
         if (used < 0).any():
             return None
-        code, flags = quantise(self._law, value - self._actual[used])
-        if dac.follow and flags.any():
+        code, flags = quantise(self._law, value - dac.actual(used, self._errors[channel]))
+        if dac.follow and flags[self._with[channel]].any():
             return None
         return code, self._law.capacitance(code) + used * dac.step, flags
 
@@ -132,10 +183,10 @@ class Conversion:
         """Convert at most one sample a channel, and set the DAC's codes for the next one."""
         used = self.dac_codes[channel]
         used = np.where(used < 0, dac.nearest(value), used)
-        code, flags = quantise(self._law, value - self._actual[used])
+        code, flags = quantise(self._law, value - dac.actual(used, self._errors[channel]))
         reported = self._law.capacitance(code) + used * dac.step
         if dac.follow:
-            used = np.where(flags > 0, _next_code(dac, self._law, used, flags), used)
+            used = np.where((flags > 0) & self._with[channel], _next_code(dac, self._law, used, flags), used)
         self.dac_codes[channel] = used
         return code, reported, flags
 

@@ -126,7 +126,7 @@ def _chip(name: str, data: Mapping[str, Any]) -> Chip:
         law["front_end"] = ShuntFrontEnd(**law["front_end"])
     if "dac" in given:
         dac = given["dac"]
-        given["dac"] = CapDac(**{**dac, "bit_errors": tuple(dac.get("bit_errors", ()))})
+        given["dac"] = CapDac(**dac, channels=data.get("inputs"))
     if "detector" in given:
         detector = given["detector"]
         tracker = {"stepping": SteppingTracker}[detector["tracker"]]()
@@ -205,6 +205,12 @@ class ReadoutOptions:
     """Capacitance that a chip which adapts to it is set up for [F]."""
     capdac: int | None = None
     """Offset DAC at the start; by default the step nearest to each channel's first sample."""
+    capdac_errors: Sequence[float] | None = None
+    """What each bit of the offset DAC has too much [F], the least significant first, as measured on
+    a specimen; by default drawn."""
+    specimen: int | None = None
+    """Number of the specimen, which decides the errors of its offset DAC; by default the seed
+    does. Without noise and a number, all are nominal."""
     law: Law | None = None
     """The converter's law, instead of the chip's: another tank, another front end."""
     nonlinearity: float = 0.0
@@ -261,11 +267,12 @@ def parts_of(chip: Chip, electrodes: Sequence[str], options: ReadoutOptions) -> 
         "bank": bank,
         "schedule": dataclasses.replace(plan, idle=idle, latency=options.latency),
         "law": law_of(chip, options, len(patterns)),
-        "dac": _dac_of(chip, options.capdac),
+        "dac": _dac_of(chip, options),
         "wiring": options.wiring,
         "stages": (*options.stages, *_stages(chip, rate.rms, options)),
         "detector": options.detector or chip.detector,
         "seed": options.seed,
+        "specimen": options.specimen,
     }
 
 
@@ -308,15 +315,23 @@ def law_of(chip: Chip, options: ReadoutOptions, channels: int) -> Law:
     return law
 
 
-def _dac_of(chip: Chip, start: int | None) -> CapDac | None:
-    """The chip's offset DAC, as it is set at the start."""
-    if start is None:
-        return chip.dac
+def _dac_of(chip: Chip, options: ReadoutOptions) -> CapDac | None:
+    """The chip's offset DAC, as it is set at the start, with what is known of the specimen."""
     if chip.dac is None:
-        raise ReadoutError(
-            f"capdac is {start!r}, but the {chip.name} has no offset DAC; leave it out"
-        )
-    return dataclasses.replace(chip.dac, start=start)
+        for name in ("capdac", "capdac_errors"):
+            if (value := getattr(options, name)) is not None:
+                raise ReadoutError(
+                    f"{name} is {value!r}, but the {chip.name} has no offset DAC; leave it out"
+                )
+        return None
+    changes: dict[str, Any] = {}
+    if options.capdac is not None:
+        changes["start"] = options.capdac
+    if options.capdac_errors is not None:
+        changes["bit_errors"] = tuple(options.capdac_errors)
+    if options.capdac_errors is not None or (not options.noise and options.specimen is None):
+        changes["mismatch"] = changes["tolerance"] = 0.0
+    return dataclasses.replace(chip.dac, **changes) if changes else chip.dac
 
 
 def expected_of(empty: Array) -> float:

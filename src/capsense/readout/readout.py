@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from capsense._validate import as_number
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Wiring
-from capsense.readout.checks import Array, phasors, real, require, require_whole
+from capsense.readout.checks import Array, Bools, phasors, real, require, require_whole
 from capsense.readout.conversions import Counts, Schedule
 from capsense.readout.converter import CapDac, Conversion, Detector
 from capsense.readout.laws import Law, ShuntLaw
@@ -22,6 +22,8 @@ from capsense.readout.presets import Chip, ReadoutOptions, chip_of, parts_of
 
 _BATCH = 4096
 """Samples processed at a time."""
+_SPECIMENS = 0xCAB
+"""Tells the random numbers of specimens from those of noise."""
 _AT_ONCE = 20_000_000
 """Samples that a single step may hold: hours of the fastest chip."""
 SEED_STRIDE = 2**32
@@ -65,6 +67,8 @@ class Readout:
         stages: Drift and noise, in order.
         detector: Digital logic; none by default.
         seed: Of all random numbers. The same seed gives the same numbers, to the last bit.
+        specimen: Number of the specimen, which decides the errors of its offset DAC; by default
+            the seed does, so that another one makes another specimen.
 
     Raises:
         ReadoutError: The parts do not fit each other.
@@ -73,13 +77,14 @@ class Readout:
     def __init__(
         self, bank: ChannelBank, schedule: Schedule, law: Law, *, dac: CapDac | None = None,
         wiring: Wiring | None = None, stages: Sequence[Stage] = (),
-        detector: Detector | None = None, seed: int = 0,
+        detector: Detector | None = None, seed: int = 0, specimen: int | None = None,
     ) -> None:  # fmt: skip
         if not isinstance(bank, ChannelBank):
             raise ReadoutError(
                 f"bank is {bank!r}; give the channels, ChannelBank(patterns, electrodes)"
             )
         self.bank = bank
+        self._sensors = 1  # many chips side by side have more
         self.name = "readout"
         """For titles."""
         for kind, parts in ((Wiring, [wiring]), (Detector, [detector]), (Stage, stages)):
@@ -91,7 +96,9 @@ class Readout:
                 f"the schedule samples {schedule.count} channels and there are {len(self.bank)}; "
                 "make them the same"
             )
-        self.schedule, self.law, self.dac = schedule, law, dac
+        if specimen is not None:
+            require_whole("readout", "specimen", specimen, 0)
+        self.schedule, self.law, self.dac, self.specimen = schedule, law, dac, specimen
         self.stages, self.detector = tuple(stages), detector
         self.wiring = wiring or Wiring()
         grounds = np.array([p.sees_ground for p in self.bank.patterns])
@@ -145,7 +152,7 @@ class Readout:
             stage.start(Context(k, plan.conversion, plan.period, np.random.default_rng(s)))
             for stage, s in zip(self.stages, seeds, strict=True)
         ]
-        self._convert = Conversion(self.law, self.dac, k)
+        self._convert = self._converter(k, self.bank.differences)
         rising = self.law.rising
         self._detect = None if self.detector is None else self.detector.start(k, rising)
         self._start = start
@@ -157,6 +164,20 @@ class Readout:
         self._next_stamp = self._next_instant + plan.lag
         self._none = self._report(-math.inf)
         self._latest = self._none
+
+    def _converter(self, channels: int, differences: Bools) -> Conversion:
+        """The converters of many channels, with the errors of their specimens."""
+        if self.dac is None:
+            return Conversion(self.law, None, channels)
+        without = np.zeros(channels, bool) if self.dac.differential else differences
+        return Conversion(self.law, self.dac, channels, self._errors(channels), without)
+
+    def _errors(self, channels: int) -> Array:
+        """Errors of the offset DACs' bits [F], shape (channels, bits)."""
+        assert self.dac is not None
+        number = self._seed if self.specimen is None else self.specimen
+        of_one = channels // self._sensors
+        return self.dac.specimens(of_one, specimen_rng(number), self._sensors)
 
     def due(self, until: float) -> Array:
         """Instants at which capacitances are wanted next [s], up to ``until`` [s], rising."""
@@ -395,6 +416,11 @@ class Readout:
         )
         if self._detect is not None and counts.baseline is not None and counts.touched is not None:
             counts.baseline[:], counts.touched[:] = self._detect(counts.channel, counts.code)
+
+
+def specimen_rng(number: int) -> np.random.Generator:
+    """Draws what differs from specimen to specimen of a chip; the same for the same number."""
+    return np.random.default_rng([number, _SPECIMENS])
 
 
 def build(

@@ -34,7 +34,8 @@ class SideBySide:
         self._one, self._count = readout, count
         k = len(readout.bank)
         many = copy.copy(readout)
-        many.bank = _Columns(k * count)  # type: ignore[assignment]
+        many.bank = _Columns(readout.bank.differences, count)  # type: ignore[assignment]
+        many._sensors = count
         slots = tuple(
             tuple(k * chip + channel for chip in range(count) for channel in slot)
             for slot in readout.schedule.slots

@@ -20,7 +20,7 @@ COUNT, NAMES = 5, tuple(f"E{k}" for k in range(1, 7))
 
 
 def without_noise(chip="fdc1004"):
-    whole = Readout.preset(chip, NAMES)
+    whole = Readout.preset(chip, NAMES, noise=False)
     return Readout(whole.bank, whole.schedule, whole.law, dac=whole.dac, wiring=whole.wiring)
 
 

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from approximate import approx
 from maxwell import random_maxwell
 
 from capsense.errors import ReadoutError
-from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
+from capsense.readout.channels import (
+    ChannelBank,
+    Pattern,
+    differential_patterns,
+    mutual_patterns,
+    self_patterns,
+    two_terminal_patterns,
+)
 
 NAMES = ("A", "B", "C", "D", "E")
 
@@ -16,27 +27,30 @@ NAMES = ("A", "B", "C", "D", "E")
 def measured(matrix, pattern, names=NAMES):
     """Slow reference: solve for the potentials and charges of all terminals at once.
 
-    Unknowns are potentials v and charges q of every electrode: q = C v, and for each electrode
-    either its potential is given or its charge is zero.
+    Unknowns are potentials v and charges q of every electrode, and the potential u of the
+    transmitter's lower end: q = C v; each electrode's potential is given, against u where the
+    transmitter drives it, or its charge is zero; u is 0, or what it drives has no charge together.
     """
     m = len(names)
-    system = np.zeros((2 * m, 2 * m))
-    right = np.zeros(2 * m)
-    system[:m, :m], system[:m, m:] = matrix / 1e-12, -np.eye(m)
+    system = np.zeros((2 * m + 1, 2 * m + 1))
+    right = np.zeros(2 * m + 1)
+    system[:m, :m], system[:m, m:-1] = matrix / 1e-12, -np.eye(m)
+    held = {**dict.fromkeys((*pattern.weights, *pattern.low), 0.0), **pattern.drive}
     for k, name in enumerate(names):
-        driven = name in pattern.drive
-        if name in pattern.floating or (
-            pattern.rest == "floating" and name != pattern.sense and not driven
-        ):
+        if name in pattern.floating or (pattern.rest == "floating" and name not in held):
             system[m + k, m + k] = 1.0
             continue
         system[m + k, k] = 1.0
-        if driven:
-            right[m + k] = pattern.drive[name]
-        elif pattern.rest == "guard" and name != pattern.sense:
-            right[m + k] = 1.0
-    charge = np.linalg.solve(system, right)[m + names.index(pattern.sense)] * 1e-12
-    return charge if pattern.sense in pattern.drive else -charge
+        right[m + k] = held.get(name, 1.0 if pattern.rest == "guard" else 0.0)
+        if name in pattern.drive or name in pattern.low:
+            system[m + k, -1] = -1.0
+            system[-1, m + k] = 1.0 if pattern.low else 0.0
+    if not pattern.low:
+        system[-1, -1] = 1.0
+    charges = np.linalg.solve(system, right)[m:-1] * 1e-12
+    out = sum(weight * charges[names.index(name)] for name, weight in pattern.weights.items())
+    out = out if any(pattern.drive.get(name) for name in pattern.weights) else -out
+    return out - (measured(matrix, pattern.minus, names) if pattern.minus else 0.0)
 
 
 PATTERNS = [
@@ -50,6 +64,20 @@ PATTERNS = [
     Pattern("E", {"A": 1.0, "B": 1.0}, floating=("C",)),
     Pattern("E", {"D": 2.0}, rest="floating", name="E, others open"),
     Pattern("E", {"D": 1.0}, rest="guard", name="E, others guarded"),
+    Pattern("C", {"C": 1.0, "D": -1.0}, name="out of phase"),
+    Pattern("C", {"C": 0.7, "D": -0.3, "A": 0.0}, floating=("E",), name="real weights"),
+    Pattern(("A", "C")),
+    Pattern(("B", "D", "E"), rest="floating", name="joined, others open"),
+    Pattern({"A": 2.0, "B": -0.5}, {"C": 1.0}, name="weighted charges"),
+    Pattern({"A": 1.0, "B": -1.0}, name="by charges"),
+    Pattern("A", minus="D"),
+    Pattern("A", floating=("C",), minus="D", name="difference, C open"),
+    Pattern("A", rest="guard", minus=Pattern("B", {"C": 1.0}), name="of two kinds"),
+    Pattern("A", low=("B",)),
+    Pattern(("A", "E"), low=("B", "D"), name="sets"),
+    Pattern("A", low="C", rest="floating", name="LCR, others open"),
+    Pattern("A", {"A": 1.0, "B": 0.4}, low=("C",), floating=("D",), name="LCR, weighted"),
+    Pattern("D", {"A": 1.0}, low=("C",), name="LCR, another read"),
 ]
 
 
@@ -66,8 +94,7 @@ def test_patterns_against_the_whole_circuit(pattern):
 def test_batches_and_single_matrices_agree_to_the_bit():
     rng = np.random.default_rng(2)
     matrices = np.array([random_maxwell(rng, 5) for _ in range(30)])
-    named = [Pattern(p.sense, p.drive, p.floating, p.rest, p.shield, str(k)) for k, p in
-             enumerate(PATTERNS)]  # fmt: skip
+    named = [replace(p, name=str(k)) for k, p in enumerate(PATTERNS)]
     bank = ChannelBank(named, NAMES)
     assert (bank.values(matrices) == [bank.values(c) for c in matrices]).all()
 
@@ -114,6 +141,68 @@ def test_families():
     assert [(p.sense, dict(p.drive)) for p in chosen] == [("A", {"C": 1.0})]
 
 
+def test_two_terminals():
+    """Analytic: an LCR meter that floats reads (C11 C22 − C12²)/(C11 + C22 + 2 C12); the same
+    whichever way round, more with further electrodes, and more with them at ground than open."""
+    rng = np.random.default_rng(6)
+    matrix = np.array([random_maxwell(rng, 5) for _ in range(50)])
+    a, b, m = matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 0, 1]
+    bank = ChannelBank(
+        [
+            *two_terminal_patterns(NAMES, [("A", "B"), ("B", "A")]),
+            Pattern("A", low=("B", "C"), name="wide"),
+            Pattern("A", low=("B",), rest="floating", name="open"),
+        ],
+        NAMES,
+    )
+    assert bank.names[:2] == ("A to B", "B to A")
+    there, back, wide, opened = bank.values(matrix).T
+    np.testing.assert_allclose(there, (a * b - m**2) / (a + b + 2 * m), rtol=1e-12)
+    np.testing.assert_allclose(back, there, rtol=1e-12)
+    assert (wide > there).all()
+    assert (there > opened).all()
+    assert (opened > -m).all()  # what goes straight over is there in any case
+
+
+def test_a_difference_is_that_of_an_fdc1004():
+    """Analytic: CHA − CHB is the difference of the self capacitances, one after the other, or of
+    the charges at once with the two in antiphase or in phase: the mutual capacitance cancels."""
+    matrix = random_maxwell(np.random.default_rng(7), 5)
+    ways = [
+        *differential_patterns(NAMES, [("B", "D")], shield=0.0),
+        Pattern(("B", "D"), {"B": 1.0, "D": -1.0}, name="antiphase"),
+        Pattern({"B": 1.0, "D": -1.0}, name="in phase"),
+    ]
+    assert ways[0].name == "B minus D"
+    found = ChannelBank(ways, NAMES).values(matrix)
+    np.testing.assert_allclose(found, matrix[1, 1] - matrix[3, 3], rtol=1e-12)
+    coupling = np.array([0.1, 0.2, 0.3, 0.4, 0.5]) * -1e-12
+    shielded = ChannelBank(differential_patterns(NAMES, [("B", "D")]), NAMES)
+    expected = matrix[1, 1] - matrix[3, 3] + 0.2e-12
+    np.testing.assert_allclose(shielded.values(matrix, coupling), expected, rtol=1e-12)
+    assert not shielded.patterns[0].sees_ground  # equal leads cancel
+
+
+def test_out_of_phase():
+    """By hand: the neighbour at −1 V adds its mutual capacitance, a shield at −1 V what it has."""
+    matrix = random_maxwell(np.random.default_rng(8), 5)
+    coupling = np.full(5, -0.3e-12)
+    bank = ChannelBank(
+        [Pattern("A", {"A": 1, "D": -1}, name="x"), Pattern("A", shield=-1.0, name="y")], NAMES
+    )
+    found = bank.values(matrix, coupling)
+    np.testing.assert_allclose(found, matrix[0, 0] + [-matrix[0, 3], 0.3e-12], rtol=1e-12)
+
+
+def test_patterns_are_copied_and_pickled():
+    for pattern in PATTERNS:
+        for twin in (copy.deepcopy(pattern), pickle.loads(pickle.dumps(pattern))):
+            assert (twin.name, twin.weights, twin.drive) == (
+                pattern.name, pattern.weights, pattern.drive,
+            )  # fmt: skip
+            assert (twin.low, twin.minus) == (pattern.low, pattern.minus)
+
+
 def test_what_can_be_measured_at_once():
     """By hand: receivers of one transmitter, unless the rest floats or is driven along."""
     for rest, times in (("grounded", 4), ("guard", 10), ("floating", 10)):
@@ -135,7 +224,18 @@ def test_what_can_be_measured_at_once():
         (lambda: Pattern("A", rest="open"), "rest = 'open'.*valid are grounded"),
         (lambda: Pattern("A", {"B": 1.0}, floating=("B",)), "'B' is floating, and driven"),
         (lambda: Pattern("A", floating=("A",)), "'A' is floating, and driven"),
-        (lambda: Pattern("A", {"A": 1.0, "B": 1.0}), "read and driven together"),
+        (lambda: Pattern({"A": float("inf")}), "the weight of 'A' is inf"),
+        (lambda: Pattern({"A": 0.0}, {"B": 1.0}), "nothing is read"),
+        (lambda: Pattern(()), "nothing is driven"),
+        (lambda: Pattern("A", floating=("B",), low=("B",)), "'B' is floating, and driven or read"),
+        (lambda: Pattern("A", low=("A",)), "'A' is driven and low"),
+        (lambda: Pattern("A", low=("B",), rest="guard"), "floats between A and B"),
+        (lambda: Pattern("A", low=("B",), shield=1.0), "no guard and no shield"),
+        (lambda: Pattern("A", minus="A"), "'A' is read and subtracted"),
+        (lambda: Pattern("A", {"B": 1.0}, minus="C"), "goes with a self measurement; give a Pat"),
+        (lambda: Pattern("A", minus=Pattern("B", minus="C")), "is a difference itself"),
+        (lambda: ChannelBank([Pattern("A", minus="F")], NAMES), "no electrode 'F'"),
+        (lambda: ChannelBank([Pattern("A", low=("F",))], NAMES), "no electrode 'F'"),
         (lambda: Pattern("A", {"B": "high"}), "the drive of 'B' is 'high'"),
         (lambda: ChannelBank([], NAMES), "at least one channel"),
         (lambda: ChannelBank(["A"], NAMES), "channel 'A' is no Pattern"),

@@ -50,7 +50,8 @@ def test_noise_is_as_stated(chip, rate):
     if chip.name in ("fdc2214", "sdr"):
         step = 0.0 if chip.name == "fdc2214" else step
     expected = math.sqrt(rate.rms**2 + (chip.relative_noise * LEVEL) ** 2 + step**2 / 12)
-    deviation = counts.capacitance.std()
+    table = counts.table()[1]
+    deviation = (table - table.mean(axis=0)).std()  # chips of a sensor differ in their DACs
     assert deviation == approx(expected, rel=5 / math.sqrt(2 * len(counts)) + 0.02)
     assert counts.code.dtype == np.int64
 
@@ -108,11 +109,69 @@ def test_rates_are_conversions_per_second():
         assert slots / readout.schedule.period == approx(rate.per_second, rel=1e-9)
 
 
-def test_dac_jump_of_the_fdc1004():
+SPECIMEN = [0.0, 0.0, -1.3e-13, 1.25e-12]
+"""CAPDAC errors of the FDC1004 of TI E2E thread 1178477 [F]."""
+
+
+def reported(level, code, **options):
+    """What an FDC1004 reports of a capacitance at a CAPDAC code [F]."""
+    options = {"noise": False, "capdac": code, **options}
+    readout = Readout.preset("fdc1004", NAMES[:1], **options)
+    return float(readout([0.0, 0.1], np.full((2, 1), level)).capacitance[0])
+
+
+def test_dac_jump_of_a_specimen():
     """Measured: 18.9 pF read with CAPDAC code 7 and 8 differ by the specimen's 1.38 pF."""
-    actual = CHIPS["fdc1004"].dac.actual()
-    jump = (8 * 3.125e-12 - actual[8]) - (7 * 3.125e-12 - actual[7])
-    assert jump == approx(-1.38e-12, rel=0.01)
+    seven, eight = (reported(18.9e-12, code, capdac_errors=SPECIMEN) for code in (7, 8))
+    np.testing.assert_allclose(eight - seven, -1.38e-12, rtol=0.01)
+    np.testing.assert_allclose(reported(39e-12, 8, capdac_errors=SPECIMEN), 37.75e-12, atol=1e-16)
+
+
+def test_specimens_differ():
+    """Measured: 39 pF at code 8 reads 38.968 pF on one FDC1004, 37.75 pF on another: specimens lie
+    about the nominal value by 2.3 % of the bit of 25 pF; the same seed is the same specimen."""
+    found = np.array([reported(39e-12, 8, noise=True, seed=seed) for seed in range(200)])
+    assert len(np.unique(found)) == 200
+    assert abs(found.mean() - 39e-12) < 4 * found.std() / 200**0.5
+    np.testing.assert_allclose(found.std(), 0.023 * 25e-12, rtol=0.2)
+    assert found.min() < 37.75e-12 < 38.968e-12 < found.max()
+    assert reported(39e-12, 8, noise=True, seed=3) == found[3]
+    assert reported(39e-12, 8) == 39e-12  # without noise it is nominal
+    one, other = (reported(39e-12, 8, specimen=5, seed=seed) for seed in (1, 2))
+    assert one == other != 39e-12
+
+
+def test_another_seed_is_another_specimen_unless_one_is_chosen():
+    """Invariant: with the noise, unless the specimen has a number of its own."""
+    for specimen, same in ((None, False), (7, True)):
+        options = {"white": 0.0, "flicker": 0.0, "capdac": 8, "specimen": specimen, "seed": 1}
+        readout = Readout.preset("fdc1004", NAMES[:1], **options)
+        told = []
+        for seed in (None, 2, 1):
+            readout.reset(seed=seed)
+            told.append(readout([0.0, 0.1], np.full((2, 1), 30e-12)).code[0])
+        assert told[0] == told[2]
+        assert bool(told[0] == told[1]) == same
+
+
+def test_each_chip_of_a_sensor_is_a_specimen():
+    """By hand: an FDC1004 has four inputs, so that six electrodes take two of them."""
+    names = [f"E{k}" for k in range(6)]
+    readout = Readout.preset("fdc1004", names, noise=False, capdac=8, specimen=0)
+    values = readout([0.0, 0.1], np.full((2, 6), 30e-12)).table()[1][0]
+    assert (values[:4] == values[0]).all()
+    assert (values[4:] == values[4]).all()
+    assert values[0] != values[4]
+
+
+def test_the_array_of_an_ad7746_is_20_percent_uncertain():
+    """Data sheet: all bits together, so that what is read goes with the code."""
+    dac = CHIPS["ad7746"].dac
+    rng = np.random.default_rng(1)
+    errors = dac.specimens(1, rng, 500) / (dac.step * 2.0 ** np.arange(7))
+    np.testing.assert_allclose(errors, errors[:, :1] * np.ones(7), rtol=1e-12)
+    assert 0.19 < np.abs(errors).max() <= 0.2
+    np.testing.assert_allclose(errors[:, 0].std(), 0.2 / 3**0.5, rtol=0.1)
 
 
 def test_offset_dac_as_the_host_sets_it():

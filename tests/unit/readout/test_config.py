@@ -13,6 +13,7 @@ from approximate import approx
 from capsense.errors import ReadoutError
 from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor, calibrate
+from capsense.readout.channels import Pattern, differential_patterns, two_terminal_patterns
 from capsense.readout.checks import phasors, require
 from capsense.readout.config import choose_readout, load_readout, parse_readout
 from capsense.readout.converter import ExponentialTracker, SteppingTracker
@@ -267,7 +268,7 @@ def test_nonlinearity():
         ('chip = "fdc1004"\nrate = 150', "fdc1004 has no rate of 150"),
         ('chip = "fdc1004"\nseed = -1', "seed = -1 must be an integer"),
         ('chip = "fdc1004"\nmode = "both"', "mode = 'both' is not known"),
-        ('chip = "fdc1004"\npairs = [["E1", "E2"]]', 'pairs is for mode = "mutual"'),
+        ('chip = "fdc1004"\npairs = [["E1", "E2"]]', "pairs is for mode = 'mutual', 'diff"),
         ('chip = "ad7746"\npairs = [["E1"]]', r"pairs\[0\] = \['E1'\] must be"),
         ('chip = "ad7746"\npairs = []', "pairs = .. must be"),
         ('chip = "ad7746"\npairs = [["E1", "E9"]]', "names no electrode 'E9'"),
@@ -295,6 +296,21 @@ def test_nonlinearity():
         ('chip = "sdr"\n[front_end]\ngain = 1e-6', "my.toml: front_end: the codes run from 0 to 0"),
         ('chip = "fdc1004"\nperiod = 0.01', "a period of 0.01 s is too short"),
         ('chip = "fdc1004"\ncapdac = 32', "my.toml: .*give a whole number from 0 to 31"),
+        ('chip = "fdc1004"\ncapdac_errors = 1e-12', "must be a list, one number a bit"),
+        ('chip = "fdc1004"\ncapdac_errors = [0,0,0,0,0,1e-13]', "bit_errors are 6, but 32 codes"),
+        ('chip = "fdc1004"\nspecimen = -1', "specimen = -1"),
+        ('chip = "fdc2214"\ncapdac_errors = [1e-13]', "the fdc2214 has no offset DAC"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = ["E1", "E9"]', "sense names no electrode 'E9'"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = { E9 = 1 }', "sense names no electrode 'E9'"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\nlow = "E2"', "low = 'E2' must be a list"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\nlow = ["E1"]', "is driven and low"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\nminus = "E9"', "minus names no elec"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\nminus = { sens = "E2" }', "key 'sens'"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = 1', "sense = 1 must be"),
+        (
+            'chip = "fdc1004"\nmode = "differential"\npairs = [["E1", "E1"]]',
+            "names one electrode twice",
+        ),
         ('chip = "fdc1004"\ncapdac = "auto"', "capdac = 'auto' must be an integer"),
         ('chip = "fdc1004"\nlatency = -1', "latency = -1 must be from 0"),
         ('chip = "ad7746"\nnonlinearity = 1', "nonlinearity = 1 must be from -0.1"),
@@ -311,6 +327,59 @@ def test_nonlinearity():
 def test_wrong_files_are_refused(text, words):
     with pytest.raises(ReadoutError, match=words):
         parse(text)
+
+
+def test_measurement_modes_in_a_file():
+    """By hand: what a file says of channels is what patterns in Python say."""
+    found = parse(
+        """
+        chip = "fdc1004"
+        specimen = 3
+        capdac_errors = [0.0, 0.0, -1.3e-13, 1.25e-12]
+        [[channel]]
+        sense = "E1"
+        drive = { E1 = 1.0, E3 = -1.0 }
+        name = "out of phase"
+        [[channel]]
+        sense = ["E1", "E2"]
+        [[channel]]
+        sense = { E1 = 0.5, E2 = -2.0 }
+        drive = { E3 = 1.0 }
+        [[channel]]
+        sense = "E1"
+        minus = "E2"
+        [[channel]]
+        sense = "E1"
+        minus = { sense = "E2", drive = { E3 = 0.5 } }
+        name = "of two kinds"
+        [[channel]]
+        sense = ["E1", "E3"]
+        low = ["E2"]
+        [[channel]]
+        sense = "E3"
+        shield = -1.0
+        """
+    )
+    assert found.bank.patterns == (
+        Pattern("E1", {"E1": 1.0, "E3": -1.0}, name="out of phase"),
+        Pattern(("E1", "E2"), shield=1.0),
+        Pattern({"E1": 0.5, "E2": -2.0}, {"E3": 1.0}),
+        Pattern("E1", shield=1.0, minus="E2"),
+        Pattern("E1", shield=1.0, minus=Pattern("E2", {"E3": 0.5}), name="of two kinds"),
+        Pattern(("E1", "E3"), low=("E2",)),
+        Pattern("E3", shield=-1.0),
+    )
+    assert found.specimen == 3
+    assert found.dac is not None
+    assert found.dac.bit_errors == (0.0, 0.0, -1.3e-13, 1.25e-12)
+    assert found.dac.mismatch == 0.0
+    for mode, make in (
+        ("differential", differential_patterns), ("two-terminal", two_terminal_patterns),
+    ):  # fmt: skip
+        head = f'chip = "fdc1004"\nmode = "{mode}"\n'
+        chosen = parse(head + 'pairs = [["E1", "E3"]]').bank.patterns
+        assert chosen == make(NAMES, [("E1", "E3")])
+        assert parse(head).bank.patterns == make(NAMES)
 
 
 @dataclass

@@ -163,7 +163,18 @@ def test_dac_steps():
     assert reported[7] - reported[4] == approx(0.0, abs=1e-15)
     assert reported[8] - reported[7] == approx(-1.4e-12, abs=2e-15)
     expected = np.array([1.1, 2.0, 3.1, 4.0, 5.1, 6.0, 7.1]) * 1e-12
-    assert CapDac(1e-12, 8, (0.1e-12,)).actual()[1:] == approx(expected, rel=1e-12)
+    actual = CapDac(1e-12, 8).actual(np.arange(1, 8), np.array([[0.1e-12, 0.0, 0.0]]))
+    assert actual == approx(expected, rel=1e-12)
+
+
+def test_a_difference_is_converted_without_a_dac():
+    """Data sheet: an FDC1004 has no CAPDAC for CHA − CHB; such channels keep code 0."""
+    dac, without = CapDac(3e-12, 32, follow=True), np.array([False, True])
+    conversion = Conversion(LINEAR, dac, 2, without=without)
+    for _ in range(2):
+        flags = conversion(np.arange(2), np.array([14e-12, 14e-12]))[2]
+        assert flags.tolist() == [Range.INSIDE, Range.ABOVE]
+        assert conversion.dac_codes.tolist() == [5, 0]
 
 
 def test_dac_follows_only_if_it_may():
@@ -229,6 +240,8 @@ def test_dac_follows_both_ways_to_its_ends():
         (lambda: CapDac(1e-12, 0), "codes is 0"),
         (lambda: CapDac(1e-12, 8, start=8), "is 8; give a whole number from 0 to 7"),
         (lambda: CapDac(1e-12, 8, (math.nan,)), "bit_errors is nan"),
+        (lambda: CapDac(1e-12, 8, (0.0,) * 4), "bit_errors are 4, but 8 codes have 3 bits"),
+        (lambda: CapDac(1e-12, 8, mismatch=-0.1), "mismatch is -0.1"),
     ],
 )
 def test_bad_converters_are_refused(make, words):
