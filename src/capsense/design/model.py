@@ -214,6 +214,11 @@ class Design:
             )
         return replace(self, ground_capacitance=tie)
 
+    @property
+    def as_built(self) -> Design:
+        """What its field depends on: whether conductors at ground are a terminal, not on what."""
+        return replace(self, ground_capacitance=0.0 if self.local_ground else None)
+
     def content_hash(self) -> str:
         """SHA-256 (hex) over the geometry, materials and domain.
 
@@ -230,7 +235,8 @@ class Design:
         lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")
         lines += ["open"] * self.domain.open
         lines += ["its cover gives way"] * (self.cover is not None)
-        lines += ["its ground is a terminal"] * self.local_ground
+        if self.ground_capacitance is not None:
+            lines.append(f"its ground on {self.ground_capacitance!r} F")
         lines += [] if self.film is None else [f"bent {_nanometres(np.array(self.film.radius))}"]
         for electrode in self.electrodes:
             lines += ["electrode", *_surface_lines(electrode.surface)]

@@ -217,7 +217,7 @@ def cache_key(design: Design, settings: BuildSettings) -> str:
     order = [
         Design("", design.domain, (), conductors=(by_name[name],)).content_hash() for name in extra
     ]
-    parts = [FORMAT, NUMERICS, design.content_hash(), order, settings.panel_scale]
+    parts = [FORMAT, NUMERICS, design.as_built.content_hash(), order, settings.panel_scale]
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 

@@ -224,7 +224,7 @@ def _pairs(
     return chosen
 
 
-class _Part(NamedTuple):
+class _Measurement(NamedTuple):
     """One of the measurements whose values make a channel's."""
 
     channel: int
@@ -265,14 +265,14 @@ class ChannelBank:
             if self.names.count(name) > 1:
                 raise ReadoutError(f"two channels are named {name!r}; give them names")
         index = {name: k for k, name in enumerate(self.electrodes)}
-        self._parts: list[_Part] = []
+        self._measurements: list[_Measurement] = []
         for k, pattern in enumerate(self.patterns):
-            self._parts.append(_part(pattern, k, 1.0, index))
+            self._measurements.append(_measurement(pattern, k, 1.0, index))
             if isinstance(pattern.minus, Pattern):
-                self._parts.append(_part(pattern.minus, k, -1.0, index))
-        first: list[tuple[_Part, int]] = []  # charges that are read, one of each channel
-        further: list[tuple[_Part, int]] = []
-        for part in self._parts:
+                self._measurements.append(_measurement(pattern.minus, k, -1.0, index))
+        first: list[tuple[_Measurement, int]] = []  # charges that are read, one of each channel
+        further: list[tuple[_Measurement, int]] = []
+        for part in self._measurements:
             for s in np.flatnonzero(part.factor).tolist():
                 (first if len(first) == part.channel else further).append((part, s))
         terms = first + further
@@ -281,7 +281,7 @@ class ChannelBank:
         self._factor = np.array([part.factor[s] for part, s in terms])
         self._volts = np.array([part.volts for part, _ in terms])
         self._shield = np.array([part.shield for part, _ in terms])
-        self._with_free = [part for part in self._parts if part.free]
+        self._with_free = [part for part in self._measurements if part.free]
 
     def __len__(self) -> int:
         return len(self.patterns)
@@ -333,7 +333,7 @@ class ChannelBank:
             )
         return out
 
-    def _induced(self, matrix: Array, coupling: Array | None, part: _Part) -> Array:
+    def _induced(self, matrix: Array, coupling: Array | None, part: _Measurement) -> Array:
         """What the potentials of free electrodes add to a channel [F]."""
         charge = (matrix * part.volts).sum(axis=-1)
         if coupling is not None:
@@ -352,7 +352,7 @@ class ChannelBank:
         return (raised * part.factor).sum(axis=-1)
 
 
-def _part(pattern: Pattern, channel: int, sign: float, index: Mapping[str, int]) -> _Part:
+def _measurement(pattern: Pattern, channel: int, sign: float, index: Mapping[str, int]) -> _Measurement:
     """A pattern, without what it subtracts, by the numbers of the electrodes.
 
     Raises:
@@ -378,7 +378,7 @@ def _part(pattern: Pattern, channel: int, sign: float, index: Mapping[str, int])
     if pattern.low:
         free.append(sorted(index[name] for name in (*pattern.drive, *pattern.low)))
     groups = tuple(np.array(group, dtype=np.int64) for group in free)
-    return _Part(channel, factor, volts, pattern.shield, groups)
+    return _Measurement(channel, factor, volts, pattern.shield, groups)
 
 
 @dataclass(frozen=True)
