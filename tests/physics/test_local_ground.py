@@ -137,13 +137,13 @@ def test_where_the_ground_is_earth_ties_are_one(field: BackgroundField) -> None:
 
 def test_a_link_of_the_robot_brings_it_nearer_to_earth(field: BackgroundField) -> None:
     """Invariant: a link adds its capacitance to earth, a floating one at the same place does not;
-    two links on the local ground are as one that touches both."""
+    one that touches what is earthed earths the board."""
     sim = simulator(field, "floating")
-    shape, pose = cs.Box((0.2, 0.02, 0.02)), cs.Pose((0.0, 0.0, -0.03))
+    shape, pose = cs.Box((0.02, 0.2, 0.02)), cs.Pose((0.1, 0.0, 0.02))
     link = {g: cs.Body(shape, pose, grounding=g) for g in ("local", "floating", "grounded")}
     found = {g: read(sim, hand(), body)[0, 0] for g, body in link.items()}
     assert found["local"] > found["floating"]
-    touching = cs.Body(cs.Sphere(0.02), cs.Pose((0.1, 0.0, -0.03)), grounding="grounded")
+    touching = cs.Body(cs.Sphere(0.02), cs.Pose((0.1, 0.1, 0.02)), grounding="grounded")
     earthed = read(sim, hand(), link["local"], touching)
     np.testing.assert_allclose(
         earthed, read(simulator(field, 1e-3), hand(), link["local"], touching), rtol=1e-6
@@ -238,7 +238,7 @@ def test_recordings_keep_grounds_and_ties(field: BackgroundField, tmp_path) -> N
     with cs.Recorder(tmp_path / "a.mcap", sim) as recorder:
         recorder.write(0.0, cs.Scene(bodies), sim.step(cs.Scene(bodies)))
     recording = cs.open_recording(tmp_path / "a.mcap")
-    assert recording.design.ground_capacitance == 1e-12
+    assert recording.session.design.ground_capacitance == 1e-12
     (step,) = recording.steps()
     for body in bodies:
         assert step.scene[body.name].grounding == body.grounding
