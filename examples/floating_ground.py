@@ -118,6 +118,10 @@ def draw(found: dict[str, np.ndarray], folder: Path) -> None:
         axes.plot(1e12 * TIES, 1e12 * values, color=colour, lw=1.6, label=name)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.set_ylim(0.1, 6.0)
+    axes.set_yticks([0.1, 0.2, 0.5, 1.0, 2.0, 5.0], ["0.1", "0.2", "0.5", "1", "2", "5"])
+    axes.set_yticks([], minor=True)
+    axes.set_xticks([0.1, 1.0, 10.0, 100.0, 1000.0], ["0.1", "1", "10", "100", "1000"])
     dress(axes, "C_g, from the local ground to earth [pF]", "change by the hand [pF]")
     axes.legend(loc="lower right", **LEGEND)
     figure.savefig(folder / "floating_ground.png", dpi=110)
@@ -135,6 +139,8 @@ def main(folder: Path, design: cs.Design | None = None) -> dict[str, np.ndarray]
     print(f"{'boundary elements, hand on earth':36}" + "".join(
         f"{'' if value is None else f'{value:.3f}':>10}" for value in REFERENCE
     ))  # fmt: skip
+    board = on(design, 0.0).background.capacitance.sum()
+    print(f"pad and plane together have {1e12 * board:.2g} pF to earth")
     for share in (0.5, 0.9):
         print(f"{share:.0%} of the signal is left at C_g = {1e12 * share_left(design, share):.2g} pF")
     draw(curves(design), folder)
