@@ -142,7 +142,9 @@ def main(folder: Path, design: cs.Design | None = None) -> dict[str, np.ndarray]
     board = on(design, 0.0).background.capacitance.sum()
     print(f"pad and plane together have {1e12 * board:.2g} pF to earth")
     for share in (0.5, 0.9):
-        print(f"{share:.0%} of the signal is left at C_g = {1e12 * share_left(design, share):.2g} pF")
+        print(
+            f"{share:.0%} of the signal is left at C_g = {1e12 * share_left(design, share):.2g} pF"
+        )
     draw(curves(design), folder)
     check(found)
     return found

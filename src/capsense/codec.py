@@ -166,9 +166,9 @@ def body_fields(body: Body) -> Fields:
     """Fields of a ``Body`` message, without its id and its shape."""
     matter, law = body.material, body.material.dispersion
     terms = () if law is None else (law.eps_inf, law.sigma, *(v for t in law.terms for v in t))
-    tied, grounding = isinstance(body.grounding, float), body.grounding
-    if isinstance(grounding, Ties):
-        grounding = f"ties {float(grounding.earth)!r} {float(grounding.local)!r}"
+    tied, grounding = isinstance(body.grounding, float), str(body.grounding)
+    if isinstance(body.grounding, Ties):
+        grounding = f"ties {float(body.grounding.earth)!r} {float(body.grounding.local)!r}"
     return {
         "name": body.name or "",
         "material": matter.name,

@@ -19,7 +19,6 @@ from capsense.fleet.bodies import on_device
 from capsense.readout import Readout
 from capsense.readout.conversions import Held
 from capsense.readout.noise import ClimateDrift, Context, Flicker, Mains, RandomWalk, White
-from capsense.readout.readout import specimen_rng
 
 
 class WarpChips:
@@ -58,8 +57,7 @@ class WarpChips:
         state.dac.fill_(-1 if dac is None or dac.start == "auto" else dac.start)
         state.bits = room(0, k, chips)
         if dac is not None:
-            number = seed if readout.specimen is None else readout.specimen
-            errors = dac.specimens(k, specimen_rng(number), chips)
+            errors = dac.specimens(k, seed, chips)
             state.bits = self._array(errors.reshape(chips, k, -1).transpose(2, 1, 0))
         state.waiting = room(math.ceil(plan.lag / plan.period) + 2, k, chips, dtype=wp.vec2d)
         self._set_stages(readout, k, chips, state)

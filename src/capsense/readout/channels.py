@@ -121,7 +121,7 @@ class Pattern:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only mapping is neither copied nor pickled by itself.
-        sense = self.sense if isinstance(self.sense, str) else dict(self.sense)
+        sense = self.sense if isinstance(self.sense, str) else self._weights_of_sense()
         figures = (self.floating, self.rest, self.shield, self.name, self.low, self.minus)
         return type(self), (sense, dict(self.drive), *figures)
 
@@ -212,9 +212,7 @@ def two_terminal_patterns(
     return tuple(Pattern(one, low=(two,), rest=rest) for one, two in _pairs(electrodes, pairs))
 
 
-def _pairs(
-    electrodes: Sequence[str], pairs: Iterable[tuple[str, str]]
-) -> list[tuple[str, str]]:
+def _pairs(electrodes: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     chosen = list(pairs) or [
         (one, two) for k, one in enumerate(electrodes) for two in electrodes[k + 1 :]
     ]
@@ -352,7 +350,9 @@ class ChannelBank:
         return (raised * part.factor).sum(axis=-1)
 
 
-def _measurement(pattern: Pattern, channel: int, sign: float, index: Mapping[str, int]) -> _Measurement:
+def _measurement(
+    pattern: Pattern, channel: int, sign: float, index: Mapping[str, int]
+) -> _Measurement:
     """A pattern, without what it subtracts, by the numbers of the electrodes.
 
     Raises:

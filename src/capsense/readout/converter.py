@@ -24,6 +24,10 @@ from capsense.readout.laws import Law
 Flags = NDArray[np.uint8]
 
 
+_SPECIMENS = 0xCAB
+"""Tells the random numbers of specimens from those of noise."""
+
+
 class Range(IntFlag):
     """Saturation of a sample."""
 
@@ -58,6 +62,9 @@ class CapDac:
     """Channels that one array serves, the first ones by the first; None for all."""
     differential: bool = True
     """Whether it works in differential measurements too."""
+    specimen: int | None = None
+    """Number of the specimen; by default the seed of the readout is, so that another one makes
+    another specimen."""
     start: int | Literal["auto"] = "auto"
     """Code at the start; ``"auto"`` takes that nearest to each channel's first sample."""
     follow: bool = True
@@ -77,23 +84,27 @@ class CapDac:
             )
         for name in ("mismatch", "tolerance"):
             require("CAPDAC", name, getattr(self, name), 0.0, "")
+        if self.specimen is not None:
+            require_whole("CAPDAC", "specimen", self.specimen, 0)
 
     @property
     def bits(self) -> int:
         """Bits of its codes."""
         return (self.codes - 1).bit_length()
 
-    def specimens(self, channels: int, rng: np.random.Generator, sensors: int = 1) -> Array:
-        """What the capacitors of new specimens have too much, for each channel that they serve.
+    def specimens(self, channels: int, seed: int, sensors: int = 1) -> Array:
+        """What the capacitors of specimens have too much, for each channel that they serve.
 
         Args:
             channels: Number of channels of one sensor.
-            rng: Draws the specimens.
+            seed: Decides the specimens, where :attr:`specimen` does not.
             sensors: How many sensors, each with specimens of its own.
 
         Returns:
             Of each bit [F], shape (sensors · channels, bits).
         """
+        number = seed if self.specimen is None else self.specimen
+        rng = np.random.default_rng([number, _SPECIMENS])
         served = self.channels or channels
         arrays = -(-channels // served)
         common = self.tolerance * rng.uniform(-1.0, 1.0, (sensors, arrays, 1))
@@ -186,7 +197,9 @@ class Conversion:
         code, flags = quantise(self._law, value - dac.actual(used, self._errors[channel]))
         reported = self._law.capacitance(code) + used * dac.step
         if dac.follow:
-            used = np.where((flags > 0) & self._with[channel], _next_code(dac, self._law, used, flags), used)
+            used = np.where(
+                (flags > 0) & self._with[channel], _next_code(dac, self._law, used, flags), used
+            )
         self.dac_codes[channel] = used
         return code, reported, flags
 

@@ -272,7 +272,6 @@ def parts_of(chip: Chip, electrodes: Sequence[str], options: ReadoutOptions) -> 
         "stages": (*options.stages, *_stages(chip, rate.rms, options)),
         "detector": options.detector or chip.detector,
         "seed": options.seed,
-        "specimen": options.specimen,
     }
 
 
@@ -318,13 +317,15 @@ def law_of(chip: Chip, options: ReadoutOptions, channels: int) -> Law:
 def _dac_of(chip: Chip, options: ReadoutOptions) -> CapDac | None:
     """The chip's offset DAC, as it is set at the start, with what is known of the specimen."""
     if chip.dac is None:
-        for name in ("capdac", "capdac_errors"):
+        for name in ("capdac", "capdac_errors", "specimen"):
             if (value := getattr(options, name)) is not None:
                 raise ReadoutError(
                     f"{name} is {value!r}, but the {chip.name} has no offset DAC; leave it out"
                 )
         return None
     changes: dict[str, Any] = {}
+    if options.specimen is not None:
+        changes["specimen"] = options.specimen
     if options.capdac is not None:
         changes["start"] = options.capdac
     if options.capdac_errors is not None:

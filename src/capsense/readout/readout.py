@@ -22,8 +22,6 @@ from capsense.readout.presets import Chip, ReadoutOptions, chip_of, parts_of
 
 _BATCH = 4096
 """Samples processed at a time."""
-_SPECIMENS = 0xCAB
-"""Tells the random numbers of specimens from those of noise."""
 _AT_ONCE = 20_000_000
 """Samples that a single step may hold: hours of the fastest chip."""
 SEED_STRIDE = 2**32
@@ -67,8 +65,6 @@ class Readout:
         stages: Drift and noise, in order.
         detector: Digital logic; none by default.
         seed: Of all random numbers. The same seed gives the same numbers, to the last bit.
-        specimen: Number of the specimen, which decides the errors of its offset DAC; by default
-            the seed does, so that another one makes another specimen.
 
     Raises:
         ReadoutError: The parts do not fit each other.
@@ -77,7 +73,7 @@ class Readout:
     def __init__(
         self, bank: ChannelBank, schedule: Schedule, law: Law, *, dac: CapDac | None = None,
         wiring: Wiring | None = None, stages: Sequence[Stage] = (),
-        detector: Detector | None = None, seed: int = 0, specimen: int | None = None,
+        detector: Detector | None = None, seed: int = 0,
     ) -> None:  # fmt: skip
         if not isinstance(bank, ChannelBank):
             raise ReadoutError(
@@ -96,9 +92,7 @@ class Readout:
                 f"the schedule samples {schedule.count} channels and there are {len(self.bank)}; "
                 "make them the same"
             )
-        if specimen is not None:
-            require_whole("readout", "specimen", specimen, 0)
-        self.schedule, self.law, self.dac, self.specimen = schedule, law, dac, specimen
+        self.schedule, self.law, self.dac = schedule, law, dac
         self.stages, self.detector = tuple(stages), detector
         self.wiring = wiring or Wiring()
         grounds = np.array([p.sees_ground for p in self.bank.patterns])
@@ -175,9 +169,7 @@ class Readout:
     def _errors(self, channels: int) -> Array:
         """Errors of the offset DACs' bits [F], shape (channels, bits)."""
         assert self.dac is not None
-        number = self._seed if self.specimen is None else self.specimen
-        of_one = channels // self._sensors
-        return self.dac.specimens(of_one, specimen_rng(number), self._sensors)
+        return self.dac.specimens(channels // self._sensors, self._seed, self._sensors)
 
     def due(self, until: float) -> Array:
         """Instants at which capacitances are wanted next [s], up to ``until`` [s], rising."""
@@ -416,11 +408,6 @@ class Readout:
         )
         if self._detect is not None and counts.baseline is not None and counts.touched is not None:
             counts.baseline[:], counts.touched[:] = self._detect(counts.channel, counts.code)
-
-
-def specimen_rng(number: int) -> np.random.Generator:
-    """Draws what differs from specimen to specimen of a chip; the same for the same number."""
-    return np.random.default_rng([number, _SPECIMENS])
 
 
 def build(

@@ -284,6 +284,7 @@ GROUND_PATHS: Mapping[str, GroundPath] = MappingProxyType(
 _LARGEST = 1e-3
 """Capacitances to ground beyond this [F] are slips of the pen."""
 
+
 @dataclass(frozen=True)
 class Ties:
     """What ties a conductor to earth and to the local ground of the sensor.

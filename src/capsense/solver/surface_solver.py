@@ -23,8 +23,8 @@ from capsense.field.panels import PLANE_TOL
 from capsense.reading import CapacitanceChange, Charges
 from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import TOUCH, Sheets
-from capsense.scene.materials import ties_of
 from capsense.scene.geometry_kernels import overlapping
+from capsense.scene.materials import ties_of
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.solver.bodies.panels import longer, windowed
 from capsense.solver.gap.gap_kernels import extent_of_body

@@ -65,9 +65,7 @@ def test_boundary_elements_have_converged() -> None:
     np.testing.assert_allclose(fine, PUBLISHED, rtol=0.02)
 
 
-def test_the_example(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field_cache: Path
-) -> None:
+def test_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field_cache: Path) -> None:
     """Differential: all of its readings of a hand on earth are within 2 % of boundary elements."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
     module = importlib.import_module("floating_ground")

@@ -299,6 +299,7 @@ def test_nonlinearity():
         ('chip = "fdc1004"\ncapdac_errors = 1e-12', "must be a list, one number a bit"),
         ('chip = "fdc1004"\ncapdac_errors = [0,0,0,0,0,1e-13]', "bit_errors are 6, but 32 codes"),
         ('chip = "fdc1004"\nspecimen = -1', "specimen = -1"),
+        ('chip = "fdc2214"\nspecimen = 1', "specimen is 1, but the fdc2214 has no offset DAC"),
         ('chip = "fdc2214"\ncapdac_errors = [1e-13]', "the fdc2214 has no offset DAC"),
         ('chip = "fdc1004"\n[[channel]]\nsense = ["E1", "E9"]', "sense names no electrode 'E9'"),
         ('chip = "fdc1004"\n[[channel]]\nsense = { E9 = 1 }', "sense names no electrode 'E9'"),
@@ -369,8 +370,8 @@ def test_measurement_modes_in_a_file():
         Pattern(("E1", "E3"), low=("E2",)),
         Pattern("E3", shield=-1.0),
     )
-    assert found.specimen == 3
     assert found.dac is not None
+    assert found.dac.specimen == 3
     assert found.dac.bit_errors == (0.0, 0.0, -1.3e-13, 1.25e-12)
     assert found.dac.mismatch == 0.0
     for mode, make in (

@@ -242,6 +242,7 @@ def test_dac_follows_both_ways_to_its_ends():
         (lambda: CapDac(1e-12, 8, (math.nan,)), "bit_errors is nan"),
         (lambda: CapDac(1e-12, 8, (0.0,) * 4), "bit_errors are 4, but 8 codes have 3 bits"),
         (lambda: CapDac(1e-12, 8, mismatch=-0.1), "mismatch is -0.1"),
+        (lambda: CapDac(1e-12, 8, specimen=-1), "specimen is -1"),
     ],
 )
 def test_bad_converters_are_refused(make, words):

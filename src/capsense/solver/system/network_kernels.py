@@ -17,10 +17,10 @@ from capsense.solver.tree.matter import FLOATING_PENALTY
 @compiled
 def any_tied(bodies):
     """Whether a body is tied to the local ground."""
+    tied = False
     for b in range(bodies.shape[0]):
-        if bodies[b].local_tie > 0.0:
-            return True
-    return False
+        tied = tied or bodies[b].local_tie > 0.0
+    return tied
 
 
 @compiled
