@@ -101,6 +101,7 @@ def describe(design: Design) -> str:
         ("design", design.name),
         ("", design.description),
         ("domain", f"{x:g} × {y:g} × {z:g} mm, {walls} {design.domain.backplane * 1e3:g} mm below"),
+        ("local ground", _ground(design)),
         ("hash", design.content_hash()[:16]),
     ]
     blocks = [
@@ -122,6 +123,14 @@ def describe(design: Design) -> str:
         ]
         blocks.append(table(("conductor", "role", *_SPANS, "area [mm²]"), rows))
     return "\n\n".join(blocks)
+
+
+def _ground(design: Design) -> str:
+    """What the local ground is on; nothing where it is earth."""
+    farads = design.ground_capacitance
+    if farads is None:
+        return ""
+    return f"{1e12 * farads:g} pF to earth" if farads else "floats"
 
 
 _SPANS = ("x [mm]", "y [mm]", "z [mm]")

@@ -20,7 +20,7 @@ from capsense._validate import suggest
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.humans.chain import Chain, LimbPart, Segment
 from capsense.scene import Material, Pose, TriMesh, material
-from capsense.scene.materials import Grounding, checked_grounding
+from capsense.scene.materials import Grounding, Ties, checked_grounding
 
 Array = NDArray[np.float64]
 
@@ -155,7 +155,13 @@ def to_mjcf(
     known: Material = material(material_name)
     root = Element("mujoco", model=limb.name)
     custom = SubElement(root, "custom")
-    for key, value in (("material", known.name), ("grounding", checked_grounding(grounding))):
+    tie = checked_grounding(grounding)
+    if isinstance(tie, Ties):
+        raise SceneError(
+            f"grounding is {tie!r}, which a MuJoCo model cannot say; give one capacitance here, "
+            "and the ties to attach(…, grounding=…)"
+        )
+    for key, value in (("material", known.name), ("grounding", tie)):
         SubElement(custom, "text", name=f"capsense.{key}:{limb.name}_*", data=str(value))
     world = SubElement(root, "worldbody")
     world.append(_mjcf_element(limb, pose, damping))
