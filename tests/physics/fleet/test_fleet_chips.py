@@ -11,7 +11,7 @@ import capsense as cs
 from capsense.errors import ReadoutError
 from capsense.fleet import Fleet
 from capsense.readout import Readout
-from capsense.readout.channels import Wiring, self_patterns
+from capsense.readout.channels import Pattern, Wiring, self_patterns
 from capsense.readout.noise import allan_deviation
 from capsense.readout.presets import CHIPS
 from capsense.readout.side_by_side import SideBySide
@@ -62,6 +62,44 @@ def test_noise_is_that_of_the_chip_and_differs():
     np.fill_diagonal(together, 0.0)
     assert np.abs(together).max() < 0.5
     assert np.abs(together).mean() < 0.1
+
+
+def test_each_sensor_has_specimens_of_its_own():
+    """Measured: CAPDACs of chips side by side differ from sensor to sensor; four channels of a
+    sensor share one."""
+    readout = Readout.preset("fdc1004", NAMES, noise=False, capdac=8, specimen=0)
+    many = SideBySide(readout, 40)
+    matrix = np.broadcast_to(30e-12 * np.eye(6), (40, 6, 6))
+    for _ in range(2):
+        many.sample(0.0, matrix)
+        found = many.sample(0.9, matrix).capacitance
+        assert (found[:, 1:4] == found[:, :1]).all()
+        assert (found[:, 4] == found[:, 5]).all()
+        assert len(np.unique(found)) == 80
+        np.testing.assert_allclose(found[:, [0, 4]].std(), 0.023 * 25e-12, rtol=0.3)
+        many.reset(seed=1)  # another noise, the same specimens
+    assert (many.sample(0.0, matrix).capacitance == 0).all()
+
+
+def test_differences_and_two_terminals_side_by_side():
+    """Differential: all modes, for many sensors as for one."""
+    patterns = [
+        Pattern("E1", minus="E2"), Pattern(("E3", "E4"), low=("E5",)),
+        Pattern({"E1": 1.0, "E2": -2.0}, {"E6": 0.5}), Pattern("E1", {"E1": 1.0, "E4": -1.0}),
+    ]  # fmt: skip
+    readout = Readout.preset("fdc1004", NAMES, patterns=patterns, noise=False)
+    many, rng = SideBySide(readout, COUNT), np.random.default_rng(11)
+    matrix = matrices(rng) + 20e-12 * np.eye(6)
+    many.sample(0.0, matrix)
+    found = many.sample(0.9, matrix)
+    for row in range(COUNT):
+        readout.reset()
+        readout.sample(0.0, matrix[row])
+        alone = readout.sample(0.9, matrix[row]).held()
+        np.testing.assert_array_equal(found.code[row], alone.code)
+    np.testing.assert_allclose(
+        found.capacitance[:, 0], matrix[:, 0, 0] - matrix[:, 1, 1], atol=1e-17
+    )
 
 
 def test_a_seed_repeats():
@@ -126,11 +164,11 @@ def on_warp(readout, count=COUNT, seed=0, empty=None):
 @pytest.mark.parametrize("chip", sorted(CHIPS))
 def test_chips_on_warp_are_those_of_the_cpu(chip):
     """Differential: all chips by name without noise, to the last code; saturation, late results,
-    large steps."""
+    large steps, and specimens of offset DACs."""
     rng = np.random.default_rng(6)
     one = without_noise(chip)
     wiring = Wiring(trace=1e-12, crosstalk=0.01)
-    one = Readout(one.bank, one.schedule, one.law, dac=one.dac, wiring=wiring)
+    one = Readout(one.bank, one.schedule, one.law, dac=CHIPS[chip].dac, wiring=wiring)
     many, sample = SideBySide(one, COUNT), on_warp(one)
     step = 0.37 * one.schedule.period
     times = np.cumsum(np.concatenate([[step] * 40, [5 * step] * 20]))
@@ -211,6 +249,13 @@ def test_refused_on_warp():
         on_warp(Readout(whole.bank, whole.schedule, whole.law, stages=[Own()]))
     with pytest.raises(ReadoutError, match="leaves electrodes open"):
         on_warp(Readout.preset("fdc1004", NAMES, patterns=self_patterns(NAMES, rest="floating")))
+    for pattern, words in (
+        (Pattern("E1", low=("E2",)), "channel 'E1 to E2' .*its transmitter floats"),
+        (Pattern("E1", minus="E2"), "channel 'E1 minus E2' reads several electrodes"),
+        (Pattern(("E1", "E2")), r"channel 'E1\+E2' reads several electrodes"),
+    ):
+        with pytest.raises(ReadoutError, match=words):
+            on_warp(Readout.preset("fdc1004", NAMES, patterns=[pattern]))
 
 
 def test_chips_are_switched_on_anew():
