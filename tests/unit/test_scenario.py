@@ -21,7 +21,7 @@ import capsense as cs
 from capsense.errors import CapSenseError, DesignError, ScenarioError
 from capsense.scenario import Excitation, Trajectory, load_scenario, parse_scenario
 from capsense.scenario.model import channels_of, slerp
-from capsense.scene import Pose
+from capsense.scene import Pose, Ties
 
 ROOT = Path(__file__).parents[2]
 BASE = tomllib.loads(
@@ -123,6 +123,13 @@ def test_material_and_grounding() -> None:
     body = parse_scenario(data).bodies[0].body
     assert (body.material.eps_r, body.material.sigma) == (4.0, 0.1)
     assert body.grounding == 1e-10
+    for value, expected in (
+        ("local", "local"),
+        ({"earth": 1e-10, "local": 2e-11}, Ties(1e-10, 2e-11)),
+        ({"local": float("inf")}, Ties(0.0, float("inf"))),
+    ):
+        data = changed(("body.0.grounding", value))
+        assert parse_scenario(data).bodies[0].body.grounding == expected
 
 
 def test_design_beside_the_scenario(tmp_path: Path) -> None:
@@ -330,6 +337,10 @@ REFUSED = [
     (("body.0.grounding", "ground"), "'ground', which is not known; did you mean 'grounded'"),
     (("body.0.grounding", 100), "100 F, more than 0.001 F.*farads; did you mean 1e-10"),
     (("body.0.grounding", 0), "not a positive finite"),
+    (("body.0.grounding", {"earth": -1.0}), "ties: earth is -1.0 F; give 0 to 0.001 F"),
+    (("body.0.grounding", {"robot": 1e-12}), "unknown key 'robot'"),
+    (("body.0.grounding", {"local": "all"}), "local is 'all' F"),
+    (("body.0.grounding", {}), "both are 0 F; give one"),
     (("body.0.grounding", True), "grounding is True, not a positive finite"),
     (("body.0.pose", {"position": [0, 0, 0]}), "pose and trajectory both"),
     (("body.0.trajectory", DROP), "missing key: give pose = "),

@@ -313,6 +313,10 @@ class Ties:
         if self.earth == self.local == 0.0:
             raise SceneError('ties: both are 0 F; give one, or grounding = "floating"')
 
+    def __truediv__(self, count: float) -> Ties:
+        """The share of each of so many bodies that are one conductor together."""
+        return Ties(self.earth / count, self.local / count)
+
 
 _Tie = Literal["grounded", "floating", "local"]
 Grounding = _Tie | float | Ties

@@ -27,7 +27,7 @@ from capsense.codec import (
 from capsense.errors import RecordingError
 from capsense.recording import describe
 from capsense.recording.ros import PACKAGE, Moment, StepMessages, decode, encode, make
-from capsense.scene import RestSurface, SurfaceMesh
+from capsense.scene import RestSurface, SurfaceMesh, Ties
 
 Recorded = tuple[Path, list[cs.Reading]]
 
@@ -62,6 +62,14 @@ def test_layers(shape: cs.Layers) -> None:
     assert (again.size, again.resolution) == (shape.size, shape.resolution)
     assert again.front.tobytes() == shape.front.tobytes()
     assert again.back.tobytes() == shape.back.tobytes()
+
+
+@pytest.mark.parametrize(
+    "grounding", ["local", Ties(1e-10, 2e-11), Ties(0.0, float("inf")), Ties(1e-12)]
+)
+def test_ties_to_a_local_ground(grounding: object) -> None:
+    body = cs.Body(cs.Sphere(0.01), grounding=grounding)
+    assert through(body).grounding == grounding
 
 
 def shape_message(**fields: object) -> Any:

@@ -13,9 +13,10 @@ import pytest
 from approximate import approx
 
 import capsense as cs
-from capsense.errors import MissingDependencyError
+from capsense.errors import MissingDependencyError, SceneError
 from capsense.humans import Build, Limb, arm, leg, load_smplx
 from capsense.humans.formats import close_openings, mjcf_body
+from capsense.scene import Ties
 
 LIMBS = [make(side=side) for make in (arm, leg) for side in ("left", "right")]  # type: ignore[arg-type]
 
@@ -156,6 +157,10 @@ def test_a_person_is_tied_to_ground_once() -> None:
     bodies = arm().bodies(grounding=100e-12)
     assert sum(b.grounding for b in bodies) == approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
     assert {b.grounding for b in arm().bodies(grounding="floating")} == {"floating"}
+    shared = arm().bodies(grounding=Ties(100e-12, 20e-12))
+    assert sum(b.grounding.local for b in shared) == approx(20e-12, rel=1e-9, abs=0)  # type: ignore[union-attr, misc]
+    with pytest.raises(SceneError, match=r"which a MuJoCo model cannot say.*attach"):
+        arm().mjcf(grounding=Ties(100e-12, 20e-12))
     assert {b.material.name for b in arm().bodies(material="skin")} == {"skin"}
 
 
