@@ -113,10 +113,13 @@ class CapDac:
         errors[..., : len(self.bit_errors)] += self.bit_errors
         return np.repeat(errors, served, axis=1)[:, :channels].reshape(-1, self.bits)
 
-    def actual(self, code: Ints, errors: Array) -> Array:
-        """What is subtracted at codes [F], shape (n,), by capacitors with errors [F], (n, bits)."""
-        on = (code[:, None] >> np.arange(self.bits)) & 1
-        return np.asarray(code * self.step + (on * errors).sum(axis=1), dtype=float)
+    def actual(self, errors: Array) -> Array:
+        """What is subtracted at each code [F], shape (channels, codes).
+
+        ``errors`` are what each channel's capacitors have too much [F], shape (channels, bits).
+        """
+        code = np.arange(self.codes)
+        return code * self.step + errors @ ((code >> np.arange(self.bits)[:, None]) & 1)
 
     def nearest(self, capacitance: Array) -> Ints:
         """Code nominally nearest to capacitances [F]."""
@@ -149,7 +152,7 @@ class Conversion:
             if errors is None:
                 errors = np.zeros((channels, dac.bits))
                 errors[:, : len(dac.bit_errors)] = dac.bit_errors
-            self._errors = errors
+            self._actual = dac.actual(errors)
             self._with = np.ones(channels, bool) if without is None else ~without
             start = -1 if dac.start == "auto" else dac.start
             self.dac_codes = np.where(self._with, start, 0)
@@ -185,7 +188,7 @@ class Conversion:
         used = self.dac_codes[channel]
         if (used < 0).any():
             return None
-        code, flags = quantise(self._law, value - dac.actual(used, self._errors[channel]))
+        code, flags = quantise(self._law, value - self._actual[channel, used])
         if dac.follow and flags[self._with[channel]].any():
             return None
         return code, self._law.capacitance(code) + used * dac.step, flags
@@ -194,7 +197,7 @@ class Conversion:
         """Convert at most one sample a channel, and set the DAC's codes for the next one."""
         used = self.dac_codes[channel]
         used = np.where(used < 0, dac.nearest(value), used)
-        code, flags = quantise(self._law, value - dac.actual(used, self._errors[channel]))
+        code, flags = quantise(self._law, value - self._actual[channel, used])
         reported = self._law.capacitance(code) + used * dac.step
         if dac.follow:
             used = np.where(

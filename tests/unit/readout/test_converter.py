@@ -163,8 +163,8 @@ def test_dac_steps():
     assert reported[7] - reported[4] == approx(0.0, abs=1e-15)
     assert reported[8] - reported[7] == approx(-1.4e-12, abs=2e-15)
     expected = np.array([1.1, 2.0, 3.1, 4.0, 5.1, 6.0, 7.1]) * 1e-12
-    actual = CapDac(1e-12, 8).actual(np.arange(1, 8), np.array([[0.1e-12, 0.0, 0.0]]))
-    assert actual == approx(expected, rel=1e-12)
+    actual = CapDac(1e-12, 8).actual(np.array([[0.1e-12, 0.0, 0.0]]))
+    assert actual[0, 1:] == approx(expected, rel=1e-12)
 
 
 def test_a_difference_is_converted_without_a_dac():
