@@ -73,6 +73,8 @@ def test_impedances_are_refused(masked):
         tied = bar(0.02, grounding=1e-12, **name)
         with pytest.raises(SceneError, match=f"{called}is tied.* 1e-12 F.*grounded and floating"):
             masked.step(cs.Scene([ball(), tied]))
+    with pytest.raises(SceneError, match="body 0 is tied to ground through 'local'"):
+        masked.step(cs.Scene([bar(0.02, grounding="local")]))
 
 
 def test_open_surfaces_are_refused(masked):

@@ -86,8 +86,10 @@ class MaskedScenes:
         conducts = np.array([b.material.is_conductor(self._excitation_frequency) for b in scene])
         for i, body in enumerate(scene):
             if body.grounding not in ("grounded", "floating"):
+                tie = body.grounding
+                way = f"{tie:g} F" if isinstance(tie, float) else repr(tie)
                 raise SceneError(
-                    f"body {body.name or i} has grounding {body.grounding!r}; method 'fem_masked' "
+                    f"body {body.name or i} is tied to ground through {way}; method 'fem_masked' "
                     "knows only grounded and floating bodies"
                 )
             if not getattr(body.shape, "closed", True):
