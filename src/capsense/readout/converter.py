@@ -119,7 +119,8 @@ class CapDac:
         ``errors`` are what each channel's capacitors have too much [F], shape (channels, bits).
         """
         code = np.arange(self.codes)
-        return code * self.step + errors @ ((code >> np.arange(self.bits)[:, None]) & 1)
+        on = (code >> np.arange(self.bits)[:, None]) & 1
+        return np.asarray(code * self.step + errors @ on, dtype=float)
 
     def nearest(self, capacitance: Array) -> Ints:
         """Code nominally nearest to capacitances [F]."""
