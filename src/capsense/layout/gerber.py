@@ -24,6 +24,8 @@ from capsense.layout.gerber_files import drills, edges, islands, opened
 from capsense.layout.kicad import FR4
 from capsense.layout.model import Slab, gather, in_metres, polygons_of, united
 
+HEAD = 65536
+"""Bytes of a file that tell what it is: P-CAD writes its list of apertures before the format."""
 TOP, BOTTOM = 0, 10_000
 """Places of the outer layers in the order of copper; inner ones have their number."""
 
@@ -70,7 +72,7 @@ def read(path: Path, error: float, thickness: float) -> BoardLayout:
 
 def is_set(path: Path) -> bool:
     """Whether a folder holds a file in Gerber format, in it or below."""
-    return any(b"%FS" in f.read_bytes()[:4000] for f in path.rglob("*") if f.is_file())
+    return any(b"%FS" in f.read_bytes()[:HEAD] for f in path.rglob("*") if f.is_file())
 
 
 class _SetReader:
@@ -89,7 +91,7 @@ class _SetReader:
         self.parts: dict[Path, Part] = {}
         unknown = []
         for file in sorted(f for f in where.rglob("*") if f.is_file()):
-            head = file.read_bytes()[:4000].decode("latin-1")
+            head = file.read_bytes()[:HEAD].decode("latin-1")
             part = part_of(file.name, head, functions.get(file.name, ""))
             if part is not None:
                 self.parts[file] = part
@@ -259,12 +261,12 @@ def _number(value: Any) -> float:
 
 
 def _is_gerber(file: Path) -> bool:
-    return b"%FS" in file.read_bytes()[:4000]
+    return b"%FS" in file.read_bytes()[:HEAD]
 
 
 def _is_negative(file: Path) -> bool:
     """Whether a file draws what is not copper, as planes of Altium and Allegro may."""
-    head = file.read_bytes()[:4000].decode("latin-1")
+    head = file.read_bytes()[:HEAD].decode("latin-1")
     stated = re.search(r"FilePolarity,Negative|%IPNEG", head)
     return bool(stated or re.search(r"\.gp\d+$", file.name.lower()))
 
@@ -292,15 +294,15 @@ _SUFFIXES = {
 _INNER = re.compile(r"\.(?:gp?|in|ly)(\d+)$|\.g(\d+)l$")
 _OTHER = re.compile(
     r"silk|legend|overlay|paste|cream|stencil|ass(em|y)|fab|courtyard|crtyd|adhes|glue|drawing|map"
-    r"|comment|cmt|keep|place|user|eco|score|test|margin|\.g(to|bo|tp|bp|pt|pb|d|g|[1-9]d?m\d)$",
+    r"|comment|cmt|keep|place|user|eco\d|score|test|margin|symbol|metalmask|\.g(to|bo|tp|bp|pt|pb|d|g|[1-9]d?m\d)$",
     re.IGNORECASE,
 )
 """Names of files that hold neither copper, mask nor outline."""
 _SIDES = (
-    (TOP, {"top", "f", "front", "component", "primary"}),
-    (BOTTOM, {"bottom", "bot", "b", "back", "secondary"}),
+    (TOP, r"top|(^|[^a-z])(front|component|primary|prm|f[-_. ]?(cu|mask))"),
+    (BOTTOM, r"bottom|(^|[^a-z])(bot|back|secondary|sec|b[-_. ]?(cu|mask))"),
 )
-_DRILL = re.compile(r"^M48\b|^T\d+C[\d.]+|^;\s*Holesize ", re.MULTILINE)
+_DRILL = re.compile(r"^M48\b|^T\d+C[\d.]+|^;(T\d+)? *Holesize ", re.MULTILINE)
 
 
 def part_of(name: str, head: str, function: str = "") -> Part | None:
@@ -351,12 +353,7 @@ def _stated(words: list[str]) -> Part | None:
 def _named(name: str) -> Part | None:
     """A part by the words of its name, without suffix."""
     stem = name.rpartition(".")[0]
-    tokens = re.findall(r"[a-z]+|\d+", stem)
-    sides = [place for place, marks in _SIDES if marks & set(tokens)]
-    glued = re.search(r"(top|bottom)", stem)
-    side = sides[0] if sides else None
-    if side is None and glued:
-        side = TOP if glued[1] == "top" else BOTTOM
+    side = next((place for place, marks in _SIDES if re.search(marks, stem)), None)
     if re.search(r"outline|profile|edge|dimension|contour", stem):
         return Part("outline", 0)
     if re.search(r"mask|resist|stop|^sm[tb]$", stem):
