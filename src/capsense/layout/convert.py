@@ -135,7 +135,7 @@ def convert(
         layers: Copper layers to take; by default all.
         tolerance: Largest deviation of the copper's outlines [m]. It is reduced to a fifth of the
             narrowest gap.
-        mask: Whether solder mask becomes layers.
+        mask: Whether solder mask becomes layers, open where it bares much copper of these nets.
         cover: Material and thickness [m] of a rigid plate in front.
 
     Raises:
@@ -163,6 +163,8 @@ def convert(
     stack = _slabs(layout, board, place, origin, top)
     if mask:
         more += _add_masks(stack, layout, board, place, origin, top, copper, used)
+    elif layout.masks:
+        more.append("Solder mask is left out; --mask makes layers of it.")
     if cover is not None:
         stack.append(_cover(Plate(*cover), board, origin, stack))
     rows = {net: _sheet(net, copper[net], origin, top) for net in assigned}
