@@ -296,9 +296,9 @@ class _BoardReader:
             elif part[0] == "zone":
                 self.zone(part, place)
             elif part[0] == "pad":
-                self.pad(part, place, turn)
+                self.pad(part, place, turn, number(item, "solder_mask_margin", self.mask_margin))
 
-    def pad(self, pad: Node, place: Place, turn: float) -> None:
+    def pad(self, pad: Node, place: Place, turn: float, mask_margin: float) -> None:
         x, y, angle = (*numbers(child(pad, "at")), 0.0, 0.0, 0.0)[:3]
         shape = self.pad_shape(pad)
         if shape is None or shape.is_empty:
@@ -308,7 +308,7 @@ class _BoardReader:
         shape = place(shapely.affinity.translate(shape, x, -y))
         holes = numbers(child(pad, "drill"))
         bare = pad[2] == "np_thru_hole" and holes and max(numbers(child(pad, "size"))) <= holes[0]
-        margin = number(pad, "solder_mask_margin", self.mask_margin)
+        margin = number(pad, "solder_mask_margin", mask_margin)
         for layer in self.on(pad):
             if layer in self.copper and not bare:
                 self.pieces.append((self.net(pad), layer, shape))
