@@ -21,8 +21,7 @@ from capsense.errors import LayoutError, require_package
 from capsense.layout.board import BoardLayout
 from capsense.layout.curves import outline_of
 from capsense.layout.gerber_files import drills, edges, islands, opened
-from capsense.layout.kicad import FR4
-from capsense.layout.model import Slab, gather, in_metres, polygons_of, united
+from capsense.layout.model import FR4, Slab, gather, in_metres, polygons_of, united
 
 HEAD = 65536
 """Bytes of a file that tell what it is: P-CAD writes its list of apertures before the format."""

@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 import capsense as cs
 from capsense.__main__ import main
 from capsense.layout.convert import BoardDesign
-from capsense.layout.kicad import parse
+from capsense.layout.sexpr import parse
 
 SLIDER = Path(__file__).parents[3] / "examples/layout/touch_slider.kicad_pcb"
 HEAD = """(kicad_pcb (version 20221018) (general (thickness 1.0))
