@@ -18,6 +18,9 @@ READERS = {
     ".kicad_pcb": "kicad",
     ".gbrjob": "gerber",
     ".gbr": "gerber",
+    ".ger": "gerber",
+    ".gtl": "gerber",
+    ".gbl": "gerber",
     ".zip": "gerber",
     ".dxf": "dxf",
     ".svg": "svg",
@@ -71,6 +74,8 @@ def _reader_of_folder(path: Path) -> str | None:
     boards = sorted(path.glob("*.kicad_pcb"))
     if boards:
         raise LayoutError(f"{path} is a folder; give the board in it, {boards[0].name}")
-    if endings & {".gbr", ".gbrjob", ".gtl", ".gbl", ".drl"}:
-        return "gerber"
-    return "stl" if ".stl" in endings else None
+    if ".stl" in endings:
+        return "stl"
+    from capsense.layout.gerber import is_set
+
+    return "gerber" if is_set(path) else None

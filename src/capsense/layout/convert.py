@@ -135,7 +135,7 @@ def convert(
         layers: Copper layers to take; by default all.
         tolerance: Largest deviation of the copper's outlines [m]. It is reduced to a fifth of the
             narrowest gap.
-        mask: Whether solder mask becomes layers.
+        mask: Whether solder mask becomes layers, open where it bares much copper of these nets.
         cover: Material and thickness [m] of a rigid plate in front.
 
     Raises:
@@ -160,7 +160,11 @@ def convert(
     origin = _center(copper, assigned)
     top = max(z for net, role in assigned.items() if role == "electrode" for z in copper[net])
     content: dict[str, Any] = {"name": name or Path(layout.source).stem, "description": ""}
-    stack = _slabs(layout, board, place, origin, top, mask)
+    stack = _slabs(layout, board, place, origin, top)
+    if mask:
+        more += _add_masks(stack, layout, board, place, origin, top, copper, used)
+    elif layout.masks:
+        more.append("Solder mask is left out; --mask makes layers of it.")
     if cover is not None:
         stack.append(_cover(Plate(*cover), board, origin, stack))
     rows = {net: _sheet(net, copper[net], origin, top) for net in assigned}
@@ -357,9 +361,8 @@ def _sheet(
 
 
 def _slabs(
-    layout: BoardData, board: Polygon, frame: _Frame, origin: tuple[float, float], top: float,
-    mask: bool,
-) -> list[dict[str, Any]]:  # fmt: skip
+    layout: BoardData, board: Polygon, frame: _Frame, origin: tuple[float, float], top: float
+) -> list[dict[str, Any]]:
     """Tables of the dielectrics, from the bottom up; neighbours of one permittivity are one."""
     slabs = []
     for slab in layout.slabs:
@@ -372,13 +375,52 @@ def _slabs(
             merged[-1] = ("board", row_[1], merged[-1][2], row_[3])
         else:
             merged.append(row_)
-    rows = [_layer(*slab, board, origin) for slab in merged]
-    if mask and merged:
-        for name, z0, sign in (("mask below", merged[0][2], -1), ("mask", merged[-1][3], 1)):
-            ends = sorted((z0, z0 + sign * layout.mask[0]))
-            rows.append(_layer(name, layout.mask[1], ends[0], ends[1], board, origin))
-        rows.sort(key=lambda row: float(row["z"][0]))
-    return rows
+    return [_layer(*slab, board, origin) for slab in merged]
+
+
+def _add_masks(
+    stack: list[dict[str, Any]], layout: BoardData, board: Polygon, frame: _Frame,
+    origin: tuple[float, float], top: float, copper: Copper, tolerance: float,
+) -> list[str]:  # fmt: skip
+    """Put solder mask below and above the dielectrics; returns notes about its openings.
+
+    An opening stays if it bares more than a hundredth of the copper of a net on its side.
+    """
+    if not stack:
+        return ["There are no dielectrics, so there is no solder mask."]
+    sides = [max(layout.heights, key=lambda k: sign * frame.height(layout.heights[k]))
+             for sign in (-1, 1)]  # fmt: skip
+    ends = float(stack[0]["z"][0]), float(stack[-1]["z"][1])
+    notes, rows = [], []
+    for name, side, z, sign in zip(("mask below", "mask"), sides, ends, (-1, 1), strict=True):
+        level = frame.height(layout.heights[side])
+        openings = polygons_of(frame.shape(layout.masks.get(side, MultiPolygon())))
+        kept: dict[int, Polygon] = {}
+        bared = []
+        for net, levels in copper.items():
+            sheet = levels.get(level, MultiPolygon())
+            found = [(k, o.intersection(sheet).area) for k, o in enumerate(openings)
+                     if o.intersects(sheet)]  # fmt: skip
+            large = {k: openings[k] for k, area in found if area > SMALL_CUTOUT * sheet.area}
+            kept |= large
+            bare = sum(area for k, area in found if k in large)
+            if large:
+                bared.append(f"{net} ({bare / sheet.area:.0%})")
+        if bared:
+            notes.append(f"The {name} is open over {', '.join(bared)}.")
+        closed = len(openings) - len(kept)
+        if closed:
+            notes.append(f"{closed} openings of the {name} are closed: they bare none of these "
+                         "nets, or less than 1 % of one.")  # fmt: skip
+        holes = simplify(shapely.union_all(list(kept.values())), tolerance)
+        parts = polygons_of(shapely.set_precision(board.difference(holes), GRID))
+        for number, part in enumerate(parts, start=1):
+            label = name if len(parts) == 1 else f"{name} {number}"
+            low, high = sorted((z, z + sign * layout.mask[0]))
+            rows.append(_layer(label, layout.mask[1], low, high, part, origin))
+    stack += rows
+    stack.sort(key=lambda row: float(row["z"][0]))
+    return notes
 
 
 def _layer(

@@ -7,7 +7,6 @@ other parts change, are read as well.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,76 +20,11 @@ from shapely.geometry.base import BaseGeometry
 from capsense._validate import read_file
 from capsense.errors import LayoutError
 from capsense.layout.board import BoardLayout
-from capsense.layout.curves import arc_through, bezier, outline_of, quarter_segments
-from capsense.layout.model import UNCONNECTED, Slab, gather, in_metres, united
+from capsense.layout.curves import XY, arc_through, bezier, outline_of, quarter_segments
+from capsense.layout.model import FR4, UNCONNECTED, Slab, gather, in_metres, united
+from capsense.layout.sexpr import Node, child, children, number, numbers, parse, word, words
 
-Node = list["str | Node"]
-XY = tuple[float, float]
 Place = Callable[[BaseGeometry], BaseGeometry]
-FR4 = 4.5
-
-_TOKEN = re.compile(r'\s*(?:([()])|"((?:[^"\\]|\\.)*)"|([^\s()"]+))')
-
-
-def parse(text: str) -> Node:
-    """The nested lists of an S-expression.
-
-    Raises:
-        ValueError: Brackets do not match.
-    """
-    stack: list[Node] = [[]]
-    for match in _TOKEN.finditer(text):
-        bracket, quoted, word = match.groups()
-        if bracket == "(":
-            stack.append([])
-        elif bracket == ")":
-            if len(stack) == 1:
-                raise ValueError("a bracket closes that was not opened")
-            done = stack.pop()
-            stack[-1].append(done)
-        else:
-            stack[-1].append(word if quoted is None else re.sub(r"\\(.)", r"\1", quoted))
-    if len(stack) != 1 or len(stack[0]) != 1 or not isinstance(stack[0][0], list):
-        raise ValueError("brackets do not match; the file is cut off")
-    return stack[0][0]
-
-
-def children(node: Node, *names: str) -> Iterator[Node]:
-    """The lists in a node that begin with one of the names."""
-    for item in node:
-        if isinstance(item, list) and item and item[0] in names:
-            yield item
-
-
-def child(node: Node, name: str) -> Node:
-    """The first list in a node that begins with a name; an empty one if there is none."""
-    return next(children(node, name), [])
-
-
-def words(node: Node) -> list[str]:
-    """The words of a list after its name."""
-    return [item for item in node[1:] if isinstance(item, str)]
-
-
-def numbers(node: Node) -> list[float]:
-    """The numbers of a list after its name."""
-    out = []
-    for word in words(node):
-        try:
-            out.append(float(word))
-        except ValueError:
-            continue
-    return out
-
-
-def number(node: Node, name: str, default: float = 0.0) -> float:
-    """The number that stands in a named list of a node."""
-    return next(iter(numbers(child(node, name))), default)
-
-
-def word(node: Node, name: str, default: str = "") -> str:
-    """The word that stands in a named list of a node."""
-    return next(iter(words(child(node, name))), default)
 
 
 @dataclass
@@ -296,9 +230,9 @@ class _BoardReader:
             elif part[0] == "zone":
                 self.zone(part, place)
             elif part[0] == "pad":
-                self.pad(part, place, turn)
+                self.pad(part, place, turn, number(item, "solder_mask_margin", self.mask_margin))
 
-    def pad(self, pad: Node, place: Place, turn: float) -> None:
+    def pad(self, pad: Node, place: Place, turn: float, mask_margin: float) -> None:
         x, y, angle = (*numbers(child(pad, "at")), 0.0, 0.0, 0.0)[:3]
         shape = self.pad_shape(pad)
         if shape is None or shape.is_empty:
@@ -308,7 +242,7 @@ class _BoardReader:
         shape = place(shapely.affinity.translate(shape, x, -y))
         holes = numbers(child(pad, "drill"))
         bare = pad[2] == "np_thru_hole" and holes and max(numbers(child(pad, "size"))) <= holes[0]
-        margin = number(pad, "solder_mask_margin", self.mask_margin)
+        margin = number(pad, "solder_mask_margin", mask_margin)
         for layer in self.on(pad):
             if layer in self.copper and not bare:
                 self.pieces.append((self.net(pad), layer, shape))

@@ -15,6 +15,8 @@ from shapely.geometry.base import BaseGeometry
 from capsense._validate import suggest
 from capsense.errors import LayoutError
 
+FR4 = 4.5
+"""Relative permittivity of boards whose material is not stated."""
 UNCONNECTED = "(no net)"
 """Name of the copper that belongs to no net."""
 

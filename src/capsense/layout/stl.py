@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from capsense.design.stl import read_stl
 from capsense.errors import LayoutError
 from capsense.layout.board import BoardLayout
-from capsense.layout.model import Slab, gather, in_metres, united
+from capsense.layout.model import FR4, Slab, gather, in_metres, united
 
 OUTLINES = ("outline", "board", "edge", "edge_cuts", "edge.cuts")
 """Names, in lower case, of what is the board and no net."""
@@ -53,8 +53,6 @@ def level_layout(
     """A layout of copper at heights [mm] on a board of FR4; layers are named by their height."""
     levels = sorted({z for _, z, _ in pieces}, reverse=True)
     names = {z: f"z = {z - levels[0] + 0.0:g} mm" for z in levels}
-    from capsense.layout.kicad import FR4
-
     depth = max(thickness, levels[0] - levels[-1]) if levels else thickness
     return BoardLayout(
         name, gather(((n, names[z], s) for n, z, s in pieces), in_metres),

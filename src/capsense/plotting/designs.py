@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 import shapely.geometry
 from matplotlib.figure import Figure
+from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
@@ -49,8 +50,8 @@ def draw_design(design: Design, ax: Axes | None = None) -> Axes:
     if ax is None:
         from matplotlib.figure import Figure
 
-        ratios, tall = ([1.0, 1.0], 9.0) if _is_curved(design) else ([4.2, 1.0], 7.2)
-        figure = Figure(figsize=(7.0, tall), layout="constrained")
+        ratios = _heights(design)
+        figure = Figure(figsize=(7.0, sum(ratios) + 1.4), layout="constrained")
         top_axes, side = figure.subplots(2, 1, height_ratios=ratios)
         ax = top_axes
     _top_view(design, ax)
@@ -154,7 +155,18 @@ def _top_view(design: Design, ax: Axes) -> None:
     ax.set_ylim(points[:, 1].min() - margin, points[:, 1].max() + margin)
     ax.set_aspect("equal")
     dress(ax, "x [mm]", "y [mm]", design.name)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, **LEGEND)
+    below = ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=4, **LEGEND)
+
+
+def _heights(design: Design) -> tuple[float, float]:
+    """Heights of the top view and the side view [inches] that both fill the figure's width."""
+    surfaces = [s.surface for s in (*design.layers, *design.sheets)]
+    x, y, z = np.ptp(np.concatenate([s.bounds for s in surfaces]), axis=0)
+    margin = 0.06 * max(x, y)
+    wide = 6.0 / (x + 2 * margin)
+    top = float(np.clip(wide * (y + 2 * margin), 2.0, 8.0))
+    return top, float(np.clip(wide * z, 1.2, 5.0)) if _is_curved(design) else 1.6
 
 
 def _label_place(surface: Surface, parts: list[Polygon]) -> tuple[float, float, float]:
@@ -171,9 +183,11 @@ def _label_place(surface: Surface, parts: list[Polygon]) -> tuple[float, float, 
 
 
 def _is_curved(design: Design) -> bool:
-    """Whether some electrode is not flat and level, or some dielectric no slab."""
-    bent = any(np.ptp(e.surface.bounds[:, 2]) > 1e-6 for e in design.electrodes)
-    return bent or any(layer.facets for layer in design.layers)
+    """Whether some electrode is not level, or some dielectric no upright prism."""
+    bent = any(np.ptp(ring_vertices(f)[0][:, 2]) > 1e-6
+               for e in design.electrodes for f in e.surface.facets)  # fmt: skip
+    tilts = [abs(float(f.axes[2][2])) for layer in design.layers for f in layer.facets]
+    return bent or any(1e-6 < t < 1 - 1e-6 for t in tilts)
 
 
 def _profile(design: Design, ax: Axes) -> None:

@@ -10,6 +10,7 @@ import trimesh
 from approximate import approx
 
 import capsense as cs
+from capsense.layout.gerber import BOTTOM, TOP, Part, layer_names, part_of
 
 
 def found(layout: cs.BoardLayout) -> dict[str, tuple[float, int]]:
@@ -123,3 +124,126 @@ def test_gerber(tmp_path: Path) -> None:
     assert areas["island2"][1] == 2
     assert layout.heights == {"F.Cu": 0.0, "B.Cu": -0.8e-3}
     assert layout.outline.area == approx(1800e-6, rel=1e-6)
+
+
+_PADS = {
+    "p.gtl": _HEAD + "%AMTURNED*21,1,$1,$2,0,0,$3*%\n%ADD10TURNED,4X1X30*%\n%ADD11C,4X2*%\nD10*\n"
+    "X10000000Y10000000D03*\nD11*\nX20000000Y10000000D03*\n%ADD12C,1*%\nD12*\n"
+    "X30000000Y10000000D03*\n%TO.N,N/C*%\nX40000000Y10000000D03*\nX45000000Y10000000D03*\n"
+    "%TO.N,SENSE*%\nX50000000Y10000000D03*\nM02*\n",
+    "p.gbl": _HEAD + "%ADD12C,3*%\nD12*\nX30000000Y10000000D03*\nX50000000Y10000000D03*\nM02*\n",
+    "p.gts": _HEAD + "%ADD10C,2*%\nD10*\nX50000000Y10000000D03*\nM02*\n",
+    "p-job.gbrjob": '{"MaterialStackup": [{"Type": "SolderMask", "Thickness": 0.015},'
+    '{"Type": "Copper", "Thickness": 0.035},'
+    '{"Type": "Dielectric", "Thickness": 0.4, "DielectricConstant": "3.4"},'
+    '{"Type": "Copper", "Thickness": 0.035}]}',
+    "p.drl": "M48\nMETRIC\nT1C0.400\n%\nT1\nX29.8Y10.0G85X30.2Y10.0\nM30\n",
+    "p-NPTH.drl": "M48\nMETRIC\nT1C0.400\n%\nT1\nX50.0Y10.0\nM30\n",
+}
+
+
+def write(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_gerber_pads_nets_and_stack(tmp_path: Path) -> None:
+    """Turned and holed apertures, slots that join, bare holes that do not, and the job's stack."""
+    pytest.importorskip("gerbonara")
+    layout = cs.load_layout(write(tmp_path, _PADS), tolerance=1e-6)
+    turned = next(s["F.Cu"] for s in layout.nets.values() if "F.Cu" in s
+                  and abs(s["F.Cu"].centroid.x - 0.01) < 1e-6)  # fmt: skip
+    assert turned.area * 1e6 == approx(4.0, rel=1e-6)
+    x0, y0, x1, y1 = (1e3 * v for v in turned.bounds)
+    cos, sin = math.cos(math.radians(30)), math.sin(math.radians(30))
+    assert x1 - x0 == approx(4 * cos + sin, rel=1e-6)
+    assert y1 - y0 == approx(4 * sin + cos, rel=1e-6)
+    ring = next(s["F.Cu"] for s in layout.nets.values() if "F.Cu" in s
+                and abs(s["F.Cu"].centroid.x - 0.02) < 1e-6)  # fmt: skip
+    assert ring.area * 1e6 == approx(math.pi * (4 - 1), rel=1e-3)
+    assert set(layout.nets["SENSE"]) == {"F.Cu"}
+    assert "N/C" not in layout.nets
+    joined = [net for net, layers in layout.nets.items() if len(layers) == 2]
+    assert len(joined) == 1
+    assert len(layout.nets) == 7
+    assert layout.heights == {"F.Cu": 0.0, "B.Cu": -0.4e-3}
+    assert [(s.eps_r, s.z) for s in layout.slabs] == [(3.4, (-0.4e-3, 0.0))]
+    assert layout.mask == (1.5e-5, 3.3)
+    assert layout.masks["F.Cu"].area * 1e6 == approx(math.pi, rel=2e-3)
+
+
+@pytest.mark.parametrize("drill", [
+    "M48\nINCH,TZ\nT1C0.0157\n%\nT1\nX13780Y7874\nM30\n",
+    "M48\nINCH,LZ\nT1C0.0157\n%\nT1\nX013780Y007874\nM30\n",
+    "M48\nMETRIC\nT1C0.400\n%\nT1\nX35000Y20000\nM30\n",
+    "M48\nMETRIC,TZ,000.000\nT1C0.400\n%\nT1\nX35000Y20000\nM30\n",
+    "M48\nMETRIC,TZ\nT1C0.400\n%\nT1\nX3500Y2000\nM30\n",
+])  # fmt: skip
+def test_gerber_drills_without_a_point(tmp_path: Path, drill: str) -> None:
+    """Of the ways to read a number, that one holds which puts holes on copper."""
+    pytest.importorskip("gerbonara")
+    layout = cs.load_layout(write(tmp_path, _FILES | {"b.drl": drill}), tolerance=1e-6)
+    assert set(layout.nets["island2"]) == {"F.Cu", "B.Cu"}
+
+
+def test_gerber_negative_plane_and_unknown_files(tmp_path: Path) -> None:
+    pytest.importorskip("gerbonara")
+    files = {k: v for k, v in _FILES.items() if k != "b.drl"}
+    files["b.gp1"] = files["b-B_Cu.gbr"]
+    files["b-what.gbr"] = files["b-B_Cu.gbr"]
+    layout = cs.load_layout(write(tmp_path, files), tolerance=1e-6)
+    assert sum(v["In1.Cu"].area for v in layout.nets.values() if "In1.Cu" in v) * 1e6 == approx(
+        1800 - math.pi, rel=1e-4
+    )
+    for words in ("b-what.gbr", "negative image", "no drill file"):
+        assert any(words in note for note in layout.notes)
+
+
+def test_gerber_sets_that_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("gerbonara")
+    write(tmp_path, _FILES | {"c-F_Cu.gbr": _FILES["b-F_Cu.gbr"]})
+    with pytest.raises(cs.LayoutError, match="two files for one copper layer, b-F_Cu"):
+        cs.load_layout(tmp_path)
+    (tmp_path / "c-F_Cu.gbr").unlink()
+    repeated = _FILES["b-B_Cu.gbr"].replace("D12*", "%SRX2Y1I5.0J0*%\nD12*", 1)
+    (tmp_path / "b-B_Cu.gbr").write_text(repeated)
+    with pytest.raises(cs.LayoutError, match="repeats blocks"):
+        cs.load_layout(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "kind", "place"), [
+    ("x-F_Cu.gbr", "copper", TOP), ("x-B.Cu.gbr", "copper", BOTTOM), ("x-In2_Cu.gbr", "copper", 2),
+    ("x.GTL", "copper", TOP), ("x.GP2", "copper", 2), ("x.G2L", "copper", 2),
+    ("x.sol", "copper", BOTTOM), ("copper_inner_l3.gbr", "copper", 3), ("TOP.art", "copper", TOP),
+    ("l4_secondary.art", "copper", BOTTOM), ("l2_gnd.art", "copper", 2),
+    ("F200_L05.gdo", "copper", 5), ("F200_L12_Bottom.gdo", "copper", BOTTOM),
+    ("board_TopMask.gbr", "mask", TOP), ("mask_sec.art", "mask", BOTTOM),
+    ("x-Edge_Cuts.gbr", "outline", 0), ("x.gko", "outline", 1),
+    ("x_BoardOutline.gbr", "outline", 0),
+    ("x-F_SilkS.gbr", None, 0), ("x-F_Paste.gbr", None, 0), ("Top_Assembly.art", None, 0),
+    ("x.gto", None, 0), ("readme.gbr", None, 0),
+])  # fmt: skip
+def test_names_of_gerber_files(name: str, kind: str | None, place: int) -> None:
+    """Names of KiCad, Protel, Eagle, OrCAD, Allegro, Siemens and DipTrace."""
+    part = part_of(name, "%FSLAX46Y46*%")
+    assert (part.kind if part else None, part.place if part else 0) == (kind, place)
+
+
+@pytest.mark.parametrize(("function", "part"), [
+    ("Copper,L1,Top", Part("copper", TOP)), ("Copper,L3,Inr", Part("copper", 2)),
+    ("Copper,L4,Bot,Signal", Part("copper", BOTTOM)), ("Soldermask,Bot", Part("mask", BOTTOM)),
+    ("Profile,NP", Part("outline")), ("Plated,1,2,Blind", Part("drill", span=(1, 2))),
+    ("MixedPlating,1,4", Part("drill", span=(1, 4))), ("NonPlated,1,2,NPTH", None),
+    ("Legend,Top", None),
+])  # fmt: skip
+def test_functions_of_gerber_files(function: str, part: Part | None) -> None:
+    """What a file says of itself counts more than its name."""
+    assert part_of("x-F_Cu.gbr", f"%FSLAX46Y46*%\n%TF.FileFunction,{function}*%") == part
+    assert part_of("x-F_Cu.gbr", "%FSLAX46Y46*%", function) == part
+
+
+def test_names_of_copper_layers() -> None:
+    assert layer_names([TOP, 2, 5, BOTTOM]) == ["F.Cu", "In1.Cu", "In2.Cu", "B.Cu"]
+    assert layer_names([1, 2, 3]) == ["F.Cu", "In1.Cu", "B.Cu"]
+    assert layer_names([BOTTOM]) == ["B.Cu"]

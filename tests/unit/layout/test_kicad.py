@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from approximate import approx
+from shapely.affinity import affine_transform
+from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
 
 import capsense as cs
 from capsense.__main__ import main
-from capsense.layout.kicad import parse
+from capsense.layout.convert import BoardDesign
+from capsense.layout.sexpr import parse
 
 SLIDER = Path(__file__).parents[3] / "examples/layout/touch_slider.kicad_pcb"
 HEAD = """(kicad_pcb (version 20221018) (general (thickness 1.0))
@@ -132,15 +135,67 @@ def test_slider_round_trip(tmp_path: Path) -> None:
     assert "0.02 mm" in text
 
 
-def test_bottom_is_mirrored(tmp_path: Path) -> None:
-    top = cs.load_layout(SLIDER).assign(["TOUCH*"], ground=["GND"]).design
-    bottom = cs.load_layout(SLIDER).assign(["TOUCH*"], ground=["GND"], side="bottom").design
-    for one, other in zip(top.sheets, bottom.sheets, strict=True):
-        assert one.surface.area == approx(other.surface.area, rel=1e-6)
-    x = [d.electrodes[0].surface.bounds[:, 0].mean() for d in (top, bottom)]
-    assert np.sign(x[0]) == -np.sign(x[1])
-    # the track of TOUCH2 on the back is then the highest copper of an electrode
-    assert bottom.electrodes[0].surface.bounds[0, 2] == approx(-0.00153, rel=1e-6)
+def on_board(made: BoardDesign) -> dict[tuple[str, float], BaseGeometry]:
+    """Copper of a design by net and height, in mm, turned back into the axes of the board."""
+    turn = -1.0 if made.side == "bottom" else 1.0
+    out: dict[tuple[str, float], BaseGeometry] = {}
+    for sheet in made.design.sheets:
+        for facet in sheet.surface.facets:
+            height = round(1e3 * turn * float(facet.origin[2]), 4) + 0.0
+            matrix = (turn, 0, 0, 1, made.origin[0], made.origin[1])
+            shape = affine_transform(
+                affine_transform(facet.footprint, matrix), (1e3, 0, 0, 1e3, 0, 0)
+            )
+            key = (sheet.name, height)
+            out[key] = out.get(key, Polygon()).union(shape)
+    return out
+
+
+def test_flipped_board_is_the_same_board(tmp_path: Path) -> None:
+    """From both sides the copper is the same, at the same places and heights of the file.
+
+    From below it is turned by half a turn about y, which is what happens to a real board; a mere
+    mirror image would exchange left and right.
+    """
+    layout = cs.load_layout(SLIDER)
+    top, bottom = (
+        layout.assign(["TOUCH1", "TOUCH3"], ground=["GND", "TOUCH2"], side=side, tolerance=1e-5)
+        for side in ("top", "bottom")
+    )
+    one, other = on_board(top), on_board(bottom)  # z = 0 is the front, where the electrodes are
+    assert set(one) == set(other)
+    for key, shape in one.items():
+        assert shape.symmetric_difference(other[key]).area < 1e-3, key
+    # seen from below, the electrode at the left of the front lies at the right
+    left = [d.design.electrodes[0].surface.bounds[:, 0].mean() for d in (top, bottom)]
+    assert left[0] < -0.01
+    assert left[1] > 0.01
+
+
+def masked(tmp_path: Path, openings: str) -> Path:
+    """The slider with solder mask that is open over the pads on these layers."""
+    text = SLIDER.read_text(encoding="utf-8")
+    path = tmp_path / "masked.kicad_pcb"
+    path.write_text(text.replace('(layers "F.Cu") (net 3', f"(layers {openings}) (net 3"))
+    return path
+
+
+def test_mask_is_open_over_bare_copper(tmp_path: Path) -> None:
+    layout = cs.load_layout(masked(tmp_path, '"F.Cu" "F.Mask"'))
+    pad = layout.nets["TOUCH2"]["F.Cu"]
+    opening = layout.masks["F.Cu"].area
+    assert pad.area < opening < pad.buffer(1.01e-4).area
+    made = layout.assign(["TOUCH*"], ground=["GND"], mask=True)
+    assert any("open over TOUCH2 (99%)" in note for note in made.notes)
+    layers = {row["name"]: row for row in made.content["layer"]}
+    hole = Polygon(layers["mask"]["holes"][0])
+    assert hole.area == approx(opening, rel=5e-3)
+    assert layers["mask"]["z"] == [0.0, 2e-5]
+    assert "size" in layers["mask below"]
+    closed = layout.assign(["TOUCH1"], ground=["GND"], mask=True)
+    assert any("1 openings of the mask are closed" in note for note in closed.notes)
+    left = layout.assign(["TOUCH*"], ground=["GND"])
+    assert any("mask is left out" in note for note in left.notes)
 
 
 @pytest.mark.parametrize(
