@@ -330,6 +330,6 @@ def test_a_skin_warns_where_all_are_blind(tiny_simulator: cs.Simulator) -> None:
 
 def test_farads_are_not_picofarads() -> None:
     """100 F is 100 pF without its exponent."""
-    with pytest.raises(cs.SceneError, match=r"100 farads.* 100 pF are 100e-12"):
+    with pytest.raises(cs.SceneError, match=r"100 F, more than .* did you mean 1e-10\?"):
         cs.Body(BALL, grounding=100)
     assert np.isclose(cs.Body(BALL, grounding=100e-12).grounding, 1e-10)
