@@ -1,4 +1,4 @@
-"""Tolerances: how capacitances scatter with a design's parameters, and how many sensors pass."""
+"""Tolerances: how capacitances and counts scatter with parameters, and how many sensors pass."""
 
 from __future__ import annotations
 
@@ -12,17 +12,27 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest, norm, qmc, triang
 
 from capsense._validate import read_toml, suggest
-from capsense.errors import ScenarioError
+from capsense.errors import CapSenseError, DesignError, ReadoutError, ScenarioError
 from capsense.scenario import ScenarioTable as Table
-from capsense.studies.points import Evaluation, StudyRow, fill_table
-from capsense.studies.sweeps import Capacitances
+from capsense.studies.capacitances import (
+    Capacitances,
+    is_code,
+    load_design_template,
+    load_readout_template,
+    load_scenario_template,
+    unit_of_output,
+)
+from capsense.studies.points import Evaluation, StudyRow, fill_table, jobs_within
+from capsense.studies.template import Template
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
-TOP_KEYS = ("name", "samples", "seed", "scenario", "parameters", "specifications", "design")
+TOP_KEYS = (
+    "name", "samples", "seed", "parameters", "specifications", "design", "scenario", "readout",
+)  # fmt: skip
 KINDS = {
     "normal": ("mean", "sigma"),
     "uniform": ("from", "to"),
@@ -55,7 +65,7 @@ class Distribution(NamedTuple):
 
 
 class Specification(NamedTuple):
-    """What an output may be [F]."""
+    """What an output may be, in F or codes."""
 
     least: float
     most: float
@@ -124,7 +134,7 @@ class Tolerances:
     """For each specification, and for all together under ``all``; empty without specifications.
     Samples without results do not pass."""
     without_results: int
-    """Samples whose design cannot be made."""
+    """Samples of which nothing can be made."""
 
 
 def tolerance(
@@ -132,17 +142,28 @@ def tolerance(
     evaluation: Evaluation,
     output: str | Path,
     *,
-    jobs: int = 1,
+    jobs: int | None = None,
     each: Callable[[int], object] = lambda count: None,
 ) -> Tolerances:
-    """Evaluate the samples of a study into a CSV file, as :func:`~capsense.studies.sweep` does, and
+    """Evaluate the samples of a study into a table, as :func:`~capsense.studies.sweep` does, and
     analyse them.
 
+    Args:
+        study: What scatters and what must hold, of :func:`~capsense.studies.load_study`.
+        evaluation: What is computed, of the same.
+        output: The table, CSV or Parquet by its name.
+        jobs: Processes; by default one a processor, fewer where memory is short.
+        each: Called with 1 for each result as it is appended.
+
     Raises:
-        DesignError: No sample has a design.
+        CapSenseError: Nothing can be made of any sample.
         ScenarioError: The file is of another study, or too few samples have results.
     """
-    rows = fill_table(study.points, evaluation, Path(output), jobs=jobs, each=each)
+    points = study.points
+    if jobs is None:
+        memory = evaluation.cost(points).memory if isinstance(evaluation, Capacitances) else 1.0
+        jobs = jobs_within(memory)
+    rows = fill_table(points, evaluation, Path(output), jobs=jobs, each=each)
     return analyse(rows, evaluation.outputs, study.specifications)
 
 
@@ -219,10 +240,10 @@ def load_study(path: str | Path) -> tuple[ToleranceStudy, Capacitances]:
             f"samples = {samples} must be a power of two above {len(parameters) + 1}, such as 64"
         )
     study = ToleranceStudy(parameters, {}, samples, top.integer("seed", 0, 2**63 - 1, 0))
-    folder = file.resolve().parent
-    scenario = folder / top.string("scenario") if "scenario" in top else None
-    template = Table(top.raw("design", "[design], a design's file"), file.name, "design").data
-    evaluation = Capacitances.of(file.name, template, folder, study.points, scenario)
+    parts = {kind: _part(top, file, kind) for kind in ("design", "scenario", "readout")}
+    if parts["design"] is None:
+        raise top.error("missing key 'design'; add [design], a design's file, or its path")
+    evaluation = Capacitances.of(parts["design"], study.points, parts["scenario"], parts["readout"])
     limits = Table(top.data.get("specifications", {}), file.name, "specifications")
     for name in limits.data:
         if name not in evaluation.outputs:
@@ -231,10 +252,37 @@ def load_study(path: str | Path) -> tuple[ToleranceStudy, Capacitances]:
     return ToleranceStudy(parameters, specifications, samples, study.seed), evaluation
 
 
+_KINDS_OF_FILES: dict[str, tuple[type[CapSenseError], Callable[[str], Any]]] = {
+    "design": (DesignError, load_design_template),
+    "scenario": (ScenarioError, load_scenario_template),
+    "readout": (ReadoutError, load_readout_template),
+}
+"""What is raised for anything that is wrong in a file, and what loads it."""
+
+
+def _part(top: Table, file: Path, kind: str) -> Any:
+    """A design, scenario or readout: a table of the study, a path relative to it, or a name."""
+    if kind not in top:
+        return None
+    error, load = _KINDS_OF_FILES[kind]
+    folder = file.resolve().parent
+    if isinstance(top.data[kind], str):
+        path = top.string(kind)
+        return load(str(folder / path) if path.endswith(".toml") else path)
+    return Template(
+        f"{file.name}: {kind}", Table(top.data[kind], file.name, kind).data, folder, error
+    )
+
+
 def _distribution(table: Table, name: str) -> Distribution:
     one = Table(table.data[name], table.source, f"parameter {name!r}")
-    if not name.isidentifier():
-        raise one.error("is no name for expressions; use letters, digits and _")
+    if "distribution" not in one:
+        raise one.error(
+            'has no distribution; write { distribution = "normal", … }, and put dotted keys in '
+            f'quotes, such as "{name}.KEY"'
+        )
+    if not (name.isidentifier() or "." in name):
+        raise one.error("is no name for expressions, and no key; use letters, digits and _")
     kind: Any = one.choice("distribution", list(KINDS))
     one.only(("distribution", *KINDS[kind]))
     if kind == "normal":
@@ -254,16 +302,17 @@ def _limits(table: Table, name: str) -> Specification:
     one = Table(table.data[name], table.source, f"specification {name!r}")
     one.only(("min", "max"))
     if not one.data:
-        raise one.error("has neither min nor max; give one or both, in F")
-    least = one.number("min", -1.0, 1.0, -np.inf, unit="F")
-    most = one.number("max", -1.0, 1.0, np.inf, unit="F")
+        raise one.error("has neither min nor max; give one or both, in F or codes")
+    bound, unit = (1e12, "codes") if is_code(name) else (1.0, "F")
+    least = one.number("min", -bound, bound, -np.inf, unit=unit)
+    most = one.number("max", -bound, bound, np.inf, unit=unit)
     if not least <= most:
         raise one.error(f"min = {least:g} is above max = {most:g}; exchange them")
     return Specification(least, most)
 
 
 def tornado(found: Tolerances, outputs: Sequence[str]) -> Figure:
-    """Bars of each parameter's effect on outputs [fF], the largest on top.
+    """Bars of each parameter's effect on outputs [fF or codes], the largest on top.
 
     Raises:
         KeyError: There is no such output.
@@ -276,8 +325,9 @@ def tornado(found: Tolerances, outputs: Sequence[str]) -> Figure:
     figure = Figure(figsize=(7, len(outputs) * (1.0 + 0.3 * rows)), layout="constrained")
     for axes, name in zip(figure.subplots(len(outputs), squeeze=False)[:, 0], outputs, strict=True):
         effects = found.outputs[name].effects
-        sizes = [1e15 * abs(e) for e in effects.values()]
+        factor, unit = unit_of_output(name)
+        sizes = [factor * abs(e) for e in effects.values()]
         axes.barh(list(effects), [2 * s for s in sizes], left=[-s for s in sizes], color=COLOURS[0])
         axes.invert_yaxis()
-        dress(axes, x="change for ± one standard deviation [fF]", title=name)
+        dress(axes, x=f"change for ± one standard deviation [{unit}]", title=name)
     return figure
