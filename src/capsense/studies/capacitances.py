@@ -20,7 +20,7 @@ from capsense.design import __file__ as design_file
 from capsense.errors import CapSenseError, DesignError, ReadoutError, ScenarioError
 from capsense.field.background import Terminals, build_background, empty_capacitance
 from capsense.field.boundary import Accuracy, build_cost, build_model, terminals
-from capsense.field.cache import cache_key, default_settings, load_or_build
+from capsense.field.cache import cache_key, default_settings, is_at_hand, load_or_build
 from capsense.reading import Reading, StepStats
 from capsense.readout import Readout
 from capsense.readout.config import TOP_KEYS as READOUT_KEYS
@@ -49,7 +49,7 @@ class Cost(NamedTuple):
     panels: int
     """Size of their boundary-element systems."""
     time: float
-    """Processor time of all [s]; more where derivatives are taken."""
+    """Processor time of their fields or matrices [s]; 0 for a field that is at hand."""
     memory: float
     """Of a process [byte]."""
 
@@ -264,7 +264,9 @@ class Capacitances:
             panels.append(build_model(design.in_units, accuracy).panels.size)
         size = round(sum(panels) / len(panels))
         time, memory = build_cost(size)
-        if self.scenario is None:
+        if self.scenario is not None and not self._varied:
+            time *= not is_at_hand(self._design(points[0])[1])
+        elif self.scenario is None:
             time, memory = 0.1 + _EMPTY_TIME * size**2, 4e8 + _EMPTY_MEMORY * size**2
         return Cost(len(sound), size, time * len(sound), memory)
 

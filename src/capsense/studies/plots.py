@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_LINES, MOST_MAPS = 24, 12
-"""Outputs of one plot over one and over two parameters."""
+"""Outputs of a kind over one parameter, and outputs over two."""
 
 
 def check_plot(
@@ -31,7 +31,8 @@ def check_plot(
     Args:
         points: Values of the parameters.
         outputs: All outputs.
-        chosen: Those to show; by default all that are no derivatives.
+        chosen: Those to show, by name or by kind, such as ``dC``; by default all that are no
+            derivatives.
 
     Returns:
         Names of the parameters that change, one or two, and of the outputs.
@@ -45,15 +46,22 @@ def check_plot(
             f"--plot shows one or two parameters, and {len(changing)} change; leave it out, or "
             "give single values to the others"
         )
+    kinds: dict[str, list[str]] = {}
+    for output in outputs:
+        kinds.setdefault(output.partition("_")[0], []).append(output)
     for name in chosen:
-        if name not in outputs:
+        if name not in outputs and name not in kinds:
             raise ScenarioError(f"--outputs: {name!r} is no output; {suggest(name, outputs)}")
-    shown = list(chosen) or [n for n in outputs if not n.startswith(("d(", "error of "))]
-    most = (MOST_LINES, MOST_MAPS)[len(changing) - 1]
-    if len(shown) > most:
+    shown = [o for name in chosen for o in kinds.get(name, [name])]
+    shown = shown or [n for n in outputs if not n.startswith(("d(", "error of "))]
+    panels = [[o for o in shown if o in kind] for kind in kinds.values()]
+    count, most = len(shown), MOST_MAPS
+    if len(changing) == 1:
+        count, most = max(map(len, panels)), MOST_LINES
+    if count > most:
         raise ScenarioError(
-            f"--plot shows {most} outputs at most, and there are {len(shown)}; choose with "
-            f"--outputs, such as {','.join(shown[:2])}"
+            f"--plot shows {most} outputs at most, and there are {count}; choose with --outputs, "
+            f"such as {','.join(shown[:2])}"
         )
     return changing, shown
 
@@ -66,7 +74,8 @@ def plot_sweep(
     Args:
         rows: Of :func:`~capsense.studies.sweep`. Where there is an error, the plot is empty.
         outputs: Names of their results.
-        chosen: Those to show; by default all that are no derivatives.
+        chosen: Those to show, by name or by kind, such as ``dC``; by default all that are no
+            derivatives.
 
     Raises:
         ScenarioError: See :func:`check_plot`.

@@ -125,6 +125,21 @@ def parse_vary(text: str) -> tuple[str, list[Value]]:
     return name, np.linspace(low, high, int(parts[2])).tolist()
 
 
+def parse_steps(texts: Sequence[str]) -> dict[str, float | None]:
+    """``NAME`` or ``NAME=STEP`` of parameters by which derivatives are taken.
+
+    Raises:
+        ScenarioError: One is something else, or a name is given twice.
+    """
+    out: dict[str, float | None] = {}
+    for text in texts:
+        name, given, step = text.partition("=")
+        if name in out:
+            raise ScenarioError(f"--derivatives {text}: {name} is given twice; keep one")
+        out[name] = quantity(f"--derivatives {text}", step) if given else None
+    return out
+
+
 def _value(text: str, value: str) -> Value:
     """A number, or a text that cannot be a number that was mistyped."""
     word = re.fullmatch(r"[^\W\d][\w .-]*", value)

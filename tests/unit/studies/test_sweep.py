@@ -7,13 +7,23 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from capsense.errors import DesignError, FieldError, ScenarioError
-from capsense.studies import sweep
-from capsense.studies.sweeps import Capacitances, grid, load_template, parse_vary
-from capsense.studies.template import fill, names_in
+from capsense.studies import Capacitances, StudyRow, derivatives
+from capsense.studies.capacitances import (
+    codes_at,
+    load_design_template,
+    load_readout_template,
+    load_scenario_template,
+)
+from capsense.studies.plots import plot_sweep
+from capsense.studies.points import fill_table, jobs_within, journal_of
+from capsense.studies.slopes import WithDerivatives, differentiate, extrapolate
+from capsense.studies.sweeps import grid, parse_steps, parse_vary
+from capsense.studies.template import Template, fill, names_in
 
 VARY = {"a": [1.0, 2.0, 3.0], "b": [0.1, 0.3]}
 DESIGN = """
@@ -39,6 +49,9 @@ class Product:
             raise DesignError("electrodes\ntouch")
         return f"{point['a']} {point['b']}"
 
+    def group(self, point: Mapping[str, float]) -> str:
+        return str(point["a"])
+
     def __call__(self, point: Mapping[str, float]) -> tuple[float, float]:
         if len(self.calls) >= self.allowed:
             raise KeyboardInterrupt
@@ -48,10 +61,14 @@ class Product:
         return point["a"] * point["b"], point["a"] / point["b"]
 
 
+def sweep(vary: Any, path: Path, evaluation: Any, **options: Any) -> list[StudyRow]:
+    return fill_table(grid(vary), evaluation, path, **options)
+
+
 def test_rows_are_exact_and_in_order(tmp_path: Path) -> None:
     """Every combination, the last parameter fastest; what cannot be made says why."""
     counted: list[int] = []
-    rows = sweep("", VARY, tmp_path / "t.csv", evaluation=Product(), each=counted.append)
+    rows = sweep(VARY, tmp_path / "t.csv", Product(), each=counted.append)
     assert [r.point for r in rows] == [{"a": a, "b": b} for a in VARY["a"] for b in VARY["b"]]
     assert len(counted) == 5
     for k, row in enumerate(rows):
@@ -76,38 +93,38 @@ def test_rows_are_exact_and_in_order(tmp_path: Path) -> None:
 def test_it_goes_on_where_it_stopped(tmp_path: Path, allowed: int, torn: bytes) -> None:
     """After an interruption, even in the middle of a line, the table is the same to the byte."""
     whole, path = tmp_path / "whole.csv", tmp_path / "t.csv"
-    sweep("", VARY, whole, evaluation=Product())
+    sweep(VARY, whole, Product())
     first = Product(allowed)
     with pytest.raises(KeyboardInterrupt):
-        sweep("", VARY, path, evaluation=first)
+        sweep(VARY, path, first)
     assert path.read_bytes().count(b"\n") == 1 + allowed
     path.write_bytes(path.read_bytes() + torn)
     second = Product()
-    sweep("", VARY, path, evaluation=second)
+    sweep(VARY, path, second)
     assert len(second.calls) == 5 - allowed
     assert not [c for c in second.calls if c in first.calls]
     assert path.read_bytes() == whole.read_bytes()
     third = Product(0)
-    sweep("", VARY, path, evaluation=third)
+    sweep(VARY, path, third)
     assert path.read_bytes() == whole.read_bytes()
 
 
 def test_processes_make_the_same_table(tmp_path: Path) -> None:
-    sweep("", VARY, tmp_path / "one.csv", evaluation=Product())
-    sweep("", VARY, tmp_path / "two.csv", evaluation=Product(), jobs=2)
+    sweep(VARY, tmp_path / "one.csv", Product())
+    sweep(VARY, tmp_path / "two.csv", Product(), jobs=2)
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
 
 
 def test_more_values_may_be_added(tmp_path: Path) -> None:
     """Of a larger grid, only what is new is computed; of a smaller one, nothing is lost."""
     path = tmp_path / "t.csv"
-    sweep("", {"a": [1.0], "b": [0.1, 0.3]}, path, evaluation=Product())
+    sweep({"a": [1.0], "b": [0.1, 0.3]}, path, Product())
     more = Product()
-    sweep("", VARY, path, evaluation=more)
+    sweep(VARY, path, more)
     assert len(more.calls) == 3
     content = path.read_bytes()
     with pytest.raises(ScenarioError, match="3 results of another study"):
-        sweep("", {"a": [1.0], "b": [0.1, 0.3]}, path, evaluation=Product())
+        sweep({"a": [1.0], "b": [0.1, 0.3]}, path, Product())
     assert path.read_bytes() == content
 
 
@@ -124,13 +141,13 @@ def test_files_that_are_no_such_table(tmp_path: Path, content: bytes, why: str) 
     path = tmp_path / "t.csv"
     path.write_bytes(content)
     with pytest.raises(ScenarioError, match=why):
-        sweep("", VARY, path, evaluation=Product())
+        sweep(VARY, path, Product())
     assert path.read_bytes() == content
 
 
 def test_nothing_can_be_made(tmp_path: Path) -> None:
     with pytest.raises(DesignError, match="touch"):
-        sweep("", {"a": [2.0], "b": [0.3]}, tmp_path / "t.csv", evaluation=Product())
+        sweep({"a": [2.0], "b": [0.3]}, tmp_path / "t.csv", Product())
     for vary in ({}, {"a": []}, {"a": [1.0] * 400, "b": [1.0] * 400}):
         with pytest.raises(ValueError, match="points"):
             grid(vary)
@@ -164,13 +181,15 @@ def test_keys_of_a_design(tmp_path: Path) -> None:
     file = tmp_path / "pads.toml"
     file.write_text(DESIGN)
     points = [{"side": 0.005}, {"side": 0.05}, {"side": 0.006}]
-    found = Capacitances.of(file.name, *load_template(file), points)
+    found = Capacitances.of(load_design_template(file), points)
     assert found.outputs == ("C0_A_A", "C0_A_B", "C0_B_B")
     assert found.key(points[0]) == found.key({"side": 0.005})
     assert found.key(points[0]) != found.key(points[2])
     with pytest.raises(DesignError):
         found.key(points[1])
-    with pytest.raises(DesignError, match="no expression uses 'sied'; did you mean 'side'"):
-        Capacitances.of(file.name, *load_template(file), [{"sied": 0.005}])
+    with pytest.raises(
+        DesignError, match="no expression uses 'sied', and it is no key; did you mean 'side'"
+    ):
+        Capacitances.of(load_design_template(file), [{"sied": 0.005}])
     with pytest.raises(DesignError, match="no design file"):
-        load_template(tmp_path / "none.toml")
+        load_design_template(tmp_path / "none.toml")

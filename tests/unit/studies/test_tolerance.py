@@ -48,6 +48,9 @@ class Line:
     def key(self, point: Mapping[str, float]) -> str:
         return repr(point)
 
+    def group(self, point: Mapping[str, float]) -> str:
+        return ""
+
     def __call__(self, point: Mapping[str, float]) -> tuple[float, float]:
         return 3 * point["a"] - point["b"], point["b"]
 
