@@ -50,9 +50,8 @@ def derivatives(
 ) -> Derivatives:
     """Derivatives of capacitances, and of their changes by bodies, by parameters of a sensor.
 
-    Central differences at three steps, each half the one before, are extrapolated to step 0; of the
-    extrapolations, that with the least estimated error is taken (C. J. F. Ridders, *Adv. Eng.
-    Software* 4, 1982, 75-76). Six evaluations are needed for each parameter.
+    Central differences at three steps, each half the one before, are extrapolated to step 0 (C. J.
+    F. Ridders, *Adv. Eng. Software* 4, 1982, 75-76). Six evaluations are needed for each parameter.
 
     Args:
         design: A design's file with expressions, or the name of a packaged design.
@@ -109,30 +108,31 @@ def differentiate(
 def extrapolate(differences: Sequence[Array]) -> tuple[Array, Array]:
     """The limit of central differences whose steps are halved from one to the next, and its error.
 
-    Neville's scheme for an error in even powers of the step. An entry's estimated error is the
-    larger of its distances from the two entries it is made of, which grows with a step that is too
-    large and, by noise, with one that is too small. For each output, the entry of least estimated
-    error is taken.
+    Neville's scheme for an error in even powers of the step. Of each output that extrapolation is
+    taken which lies nearest to the two entries it is made of, after Ridders: they part where the
+    step is too large and, by noise, where it is too small. Its estimated error is its largest
+    distance from any other extrapolation.
 
     Args:
-        differences: At least two, the largest step first, each of shape (n,).
+        differences: Three or more, the largest step first, each of shape (n,).
 
     Returns:
         Limits and estimated errors, shape (n,) each.
     """
     best = np.array(differences[0], dtype=float)
-    error = np.full(best.shape, np.inf)
-    above = [best]
+    apart = np.full(best.shape, np.inf)
+    above, found = [best], []
     for difference in differences[1:]:
         row = [np.asarray(difference, dtype=float)]
         for order, before in enumerate(above, start=1):
             better = row[-1] + (row[-1] - before) / (4.0**order - 1.0)
-            estimate = np.maximum(np.abs(better - row[-1]), np.abs(better - before))
-            best = np.where(estimate < error, better, best)
-            error = np.minimum(error, estimate)
+            distance = np.maximum(np.abs(better - row[-1]), np.abs(better - before))
+            best = np.where(distance < apart, better, best)
+            apart = np.minimum(apart, distance)
             row.append(better)
+        found += row[1:]
         above = row
-    return best, error
+    return best, np.max(np.abs(best - np.array(found)), axis=0)
 
 
 @dataclass(frozen=True)
