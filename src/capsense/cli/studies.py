@@ -383,7 +383,7 @@ def tolerance(args: argparse.Namespace) -> int:
       capsense tolerance study.toml -o samples.csv
       capsense tolerance study.toml -o samples.parquet --plot tornado.png --jobs 2
     """
-    from capsense.studies.tolerances import analyse, load_study, tornado
+    from capsense.studies.tolerances import analyse, load_study, narrowed, tornado
 
     _check_files(args)
     study, evaluation = load_study(args.study)
@@ -394,6 +394,16 @@ def tolerance(args: argparse.Namespace) -> int:
         tornado(found, shown).savefig(args.plot, dpi=150)
     if not args.quiet:
         print(_tolerance_report(found))
+        if found.yields:
+            held = {
+                name: narrowed(found, study.specifications, {name: 0.0})["all"]
+                for name in study.parameters
+            }
+            lines = [
+                (name, f"{100 * y.share:.1f}", f"{100 * y.low:.1f} to {100 * y.high:.1f}")
+                for name, y in sorted(held.items(), key=lambda item: -item[1].share)
+            ]
+            print(f"\n{table(('without the scatter of', 'yield [%]', '95 % interval'), lines)}")
         print(f"\n{len(rows)} samples in {args.output}{_without_results(rows)}")
     return OK
 

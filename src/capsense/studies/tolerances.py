@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -53,6 +53,16 @@ class Distribution(NamedTuple):
     """Standard deviation of a normal distribution, upper end of others."""
     peak: float = 0.0
     """The most likely value of a triangular distribution."""
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation."""
+        if self.kind == "normal":
+            return self.second
+        width = self.second - self.first
+        if self.kind == "uniform":
+            return float(width / np.sqrt(12.0))
+        return float(triang.std((self.peak - self.first) / width, scale=width))
 
     def values(self, shares: Array) -> Array:
         """Quantiles of shares in (0, 1)."""
@@ -135,6 +145,8 @@ class Tolerances:
     Samples without results do not pass."""
     without_results: int
     """Samples of which nothing can be made."""
+    rows: tuple[StudyRow, ...] = field(repr=False)
+    """The samples."""
 
 
 def tolerance(
@@ -175,6 +187,35 @@ def analyse(
     Raises:
         ScenarioError: Too few samples have results for a linear fit.
     """
+    x, y = _samples(rows)
+    found = {name: _output(list(rows[0].point), x, y[:, k]) for k, name in enumerate(outputs)}
+    yields = _yields(y, outputs, specifications, len(rows))
+    return Tolerances(found, yields, len(rows) - len(y), tuple(rows))
+
+
+def narrowed(
+    found: Tolerances, specifications: Mapping[str, Specification], factors: Mapping[str, float]
+) -> dict[str, Yield]:
+    """Yields of the same samples if some parameters scattered less: what a tighter tolerance gives.
+
+    Each output is moved along its linear fit; what the fit does not explain stays.
+
+    Args:
+        found: Of the samples as they are.
+        specifications: What must hold.
+        factors: Of some parameters, the new standard deviation over the present one: 0.5 halves it,
+            0 holds the parameter at its mean.
+    """
+    x, y = _samples(found.rows)
+    away = _scaled(x)
+    slopes = np.linalg.lstsq(away, y - y.mean(axis=0), rcond=None)[0]
+    less = np.array([factors.get(name, 1.0) - 1.0 for name in found.rows[0].point])
+    moved = y + (away * less) @ slopes
+    return _yields(moved, list(found.outputs), specifications, len(found.rows))
+
+
+def _samples(rows: Sequence[StudyRow]) -> tuple[Array, Array]:
+    """Parameters and results of the samples that have results, (n, parameters), (n, outputs)."""
     good = [row for row in rows if not row.error]
     names = list(rows[0].point)
     if len(good) < len(names) + 2:
@@ -182,24 +223,32 @@ def analyse(
             f"{len(good)} samples have results, too few for a linear fit of {len(names)} "
             f"parameters; give more than {len(names) + 1}"
         )
-    x = np.array([list(row.point.values()) for row in good])
-    y = np.array([row.results for row in good])
-    found = {name: _output(names, x, y[:, k]) for k, name in enumerate(outputs)}
-    passed = {
-        name: (y[:, list(outputs).index(name)] >= limits.least)
-        & (y[:, list(outputs).index(name)] <= limits.most)
-        for name, limits in specifications.items()
-    }
+    x = np.array([list(row.point.values()) for row in good], dtype=float)
+    return x, np.array([row.results for row in good])
+
+
+def _scaled(x: Array) -> Array:
+    """Parameters from their means, in standard deviations."""
+    deviations = x.std(axis=0)
+    return np.asarray((x - x.mean(axis=0)) / np.where(deviations > 0, deviations, 1.0))
+
+
+def _yields(
+    y: Array, outputs: Sequence[str], specifications: Mapping[str, Specification], count: int
+) -> dict[str, Yield]:
+    """Yields of results, of ``count`` samples in all, for each specification and for all."""
+    passed = {}
+    for name, limits in specifications.items():
+        values = y[:, list(outputs).index(name)]
+        passed[name] = (values >= limits.least) & (values <= limits.most)
     if passed:
         passed["all"] = np.logical_and.reduce(list(passed.values()))
-    yields = {name: _yield(int(p.sum()), len(rows)) for name, p in passed.items()}
-    return Tolerances(found, yields, len(rows) - len(good))
+    return {name: _yield(int(p.sum()), count) for name, p in passed.items()}
 
 
 def _output(names: Sequence[str], x: Array, y: Array) -> Output:
     centred = y - y.mean()
-    deviations = x.std(axis=0)
-    scaled = (x - x.mean(axis=0)) / np.where(deviations > 0, deviations, 1.0)
+    scaled = _scaled(x)
     effects = np.linalg.lstsq(scaled, centred, rcond=None)[0]
     rest = float(np.mean((centred - scaled @ effects) ** 2))
     total = float(np.sum(effects**2)) + rest
