@@ -34,6 +34,9 @@ OPTIONS = {
 }
 """What can be done: its cost for each sensor, the parameter, and how that scatters then."""
 
+JOBS: int | None = None
+"""Processes; None for one a processor, fewer where memory is short."""
+
 
 def main(folder: Path, samples: int | None = None) -> bool:
     """Carry it out; whether the decision is confirmed.
@@ -45,7 +48,7 @@ def main(folder: Path, samples: int | None = None) -> bool:
     folder.mkdir(parents=True, exist_ok=True)
     study, evaluation = load_study(STUDY)
     study = replace(study, samples=samples or study.samples)
-    found = tolerance(study, evaluation, folder / "today.csv")
+    found = tolerance(study, evaluation, folder / "today.csv", jobs=JOBS)
     tornado(found, ["dcode_E"]).savefig(folder / "tornado.png", dpi=150)
     print(f"today: {told(found.yields['all'])}")
     for name, share in found.outputs["dcode_E"].contributions.items():
@@ -57,7 +60,7 @@ def main(folder: Path, samples: int | None = None) -> bool:
         return False
     tighter = {OPTIONS[name][1]: OPTIONS[name][2] for name in choice}
     better = replace(study, parameters={**study.parameters, **tighter})
-    checked = tolerance(better, evaluation, folder / "tightened.csv").yields["all"]
+    checked = tolerance(better, evaluation, folder / "tightened.csv", jobs=JOBS).yields["all"]
     cost = sum(OPTIONS[name][0] for name in choice)
     print(f"check of {' and '.join(choice) or 'nothing'}: {told(checked)}")
     confirmed = checked.share >= TARGET
@@ -67,7 +70,7 @@ def main(folder: Path, samples: int | None = None) -> bool:
 
 
 def cheapest(study: ToleranceStudy, found: Tolerances) -> tuple[str, ...] | None:
-    """The cheapest choice of options whose yield, by the samples' linear fit, reaches the target."""
+    """The cheapest choice of options whose yield by the linear fit reaches the target."""
     choices = [c for count in range(len(OPTIONS) + 1) for c in combinations(OPTIONS, count)]
     good = []
     for choice in choices:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from capsense._validate import suggest
 from capsense.design import TOP_KEYS as DESIGN_KEYS
-from capsense.design import Design, available_designs, parse_design
+from capsense.design import Design, load_design, parse_design
 from capsense.design import __file__ as design_file
 from capsense.errors import CapSenseError, DesignError, ReadoutError, ScenarioError
 from capsense.field.background import Terminals, build_background, empty_capacitance
@@ -326,7 +326,8 @@ def load_design_template(design: str | Path) -> Template:
     Raises:
         DesignError: There is no such design, or it is not TOML.
     """
-    if str(design) in available_designs():
+    if not str(design).endswith(".toml"):
+        load_design(str(design))  # or the error that says which names there are
         design = Path(design_file).parent / "library" / f"{design}.toml"
     return Template.load(design, "design", DesignError)
 
