@@ -378,5 +378,7 @@ def tornado(found: Tolerances, outputs: Sequence[str]) -> Figure:
         sizes = [factor * abs(e) for e in effects.values()]
         axes.barh(list(effects), [2 * s for s in sizes], left=[-s for s in sizes], color=COLOURS[0])
         axes.invert_yaxis()
+        room = 1.05 * max(sizes) or 1.0
+        axes.set_xlim(-room, room)
         dress(axes, x=f"change for ± one standard deviation [{unit}]", title=name)
     return figure
