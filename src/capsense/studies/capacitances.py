@@ -264,8 +264,8 @@ class Capacitances:
             panels.append(build_model(design.in_units, accuracy).panels.size)
         size = round(sum(panels) / len(panels))
         time, memory = build_cost(size)
-        if self.scenario is not None and not self._varied:
-            time *= not is_at_hand(self._design(points[0])[1])
+        if self.scenario is not None and not self._varied:  # one process builds, others wait
+            time, memory = time * (not is_at_hand(next(iter(sound)))), 4e8
         elif self.scenario is None:
             time, memory = 0.1 + _EMPTY_TIME * size**2, 4e8 + _EMPTY_MEMORY * size**2
         return Cost(len(sound), size, time * len(sound), memory)
@@ -295,7 +295,7 @@ def _keys(files: Mapping[str, Template], names: Sequence[str]) -> dict[str, tupl
             continue
         first = name.partition(".")[0]
         kind = next((k for k, keys in KEYS.items() if first in keys), "")
-        if kind in files and not name.startswith("noise"):
+        if kind in files and first != "noise":
             out[kind] = (*out.get(kind, ()), name)
         elif kind == "readout" and kind in files:
             raise ReadoutError(f"{name}: studies leave noise out; vary calibration.offset instead")

@@ -324,9 +324,9 @@ def _evaluated(
             yield key, *_evaluate(evaluation, point)
         return
     context = get_context("spawn")
-    queue = context.Queue()
+    queue, stop = context.Queue(), context.Event()
     pool = ProcessPoolExecutor(
-        min(jobs, len(tasks)), mp_context=context, initializer=_begin, initargs=(queue,)
+        min(jobs, len(tasks)), mp_context=context, initializer=_begin, initargs=(queue, stop)
     )
     with pool:
         futures: list[Future[None]] = [pool.submit(_carry_out, evaluation, t) for t in tasks]
@@ -348,6 +348,7 @@ def _evaluated(
                 "with fewer --jobs"
             ) from None
         finally:
+            stop.set()
             pool.shutdown(cancel_futures=True)
 
 
@@ -363,18 +364,21 @@ def _tasks(
     return [*groups.values(), *(free[k::parts] for k in range(parts) if free)]
 
 
-_queue: Any = None
-"""Where a process puts what it has found."""
+_parent: list[Any] = []
+"""In a process: the queue for what it has found, and an event that tells it to stop."""
 
 
-def _begin(queue: Any) -> None:
-    global _queue
-    _queue = queue
+def _begin(queue: Any, stop: Any) -> None:
+    queue.cancel_join_thread()  # who is stopped leaves results that nobody waits for
+    _parent[:] = queue, stop
 
 
 def _carry_out(evaluation: Evaluation, task: list[tuple[str, Point]]) -> None:
+    queue, stop = _parent
     for key, point in task:
-        _queue.put((key, *_evaluate(evaluation, point)))
+        if stop.is_set():
+            return
+        queue.put((key, *_evaluate(evaluation, point)))
 
 
 def _evaluate(evaluation: Evaluation, point: Point) -> _Found:

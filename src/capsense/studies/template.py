@@ -8,6 +8,7 @@ import math
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ class Template:
         file = Path(path)
         return cls(file.name, read_toml(file, what, error), file.resolve().parent, error)
 
-    @property
+    @cached_property
     def parameters(self) -> frozenset[str]:
         """Names that its expressions use, and its dotted keys."""
         return frozenset(names_in(self.content) | set(self.keys))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -117,6 +118,25 @@ def test_processes_make_the_same_table(tmp_path: Path) -> None:
     sweep(VARY, tmp_path / "one.csv", Product())
     sweep(VARY, tmp_path / "two.csv", Product(), jobs=2)
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
+
+
+class Deadly(Product):
+    """Ends its process where b is large."""
+
+    def __call__(self, point: Mapping[str, float]) -> tuple[float, float]:
+        if point["b"] > 0.2:
+            os._exit(1)
+        return super().__call__(point)
+
+
+def test_a_process_that_dies(tmp_path: Path) -> None:
+    """It is reported, and what was found before is kept."""
+    path = tmp_path / "t.csv"
+    with pytest.raises(ChildProcessError, match="fewer --jobs"):
+        sweep(VARY, path, Deadly(), jobs=2)
+    whole = Product()
+    sweep(VARY, path, whole)
+    assert {"a": 1.0, "b": 0.3} in whole.calls
 
 
 def test_more_values_may_be_added(tmp_path: Path) -> None:
