@@ -1,7 +1,7 @@
 """What a Maxwell matrix alone costs beside a field: ``python benchmarks/empty_capacitance.py``.
 
 Sweeps without bodies need the matrix of the empty domain only. Both ways agree to the last bit.
-Times are of this machine, one process, as found; the kernels are compiled before.
+Times are of the processor, all threads of one process; the kernels are compiled before.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ def main(names: tuple[str, ...]) -> None:
         design = load_design(name)
         for resolution in (0.25, 1.0):
             settings = BuildSettings().refined(resolution)
-            start = time.perf_counter()
+            start = time.process_time()
             matrix = empty_capacitance(design, settings)
-            middle = time.perf_counter()
+            middle = time.process_time()
             field = build_background(design, settings)
-            end = time.perf_counter()
+            end = time.process_time()
             same = np.array_equal(matrix, field.capacitance)
             alone, whole = middle - start, end - middle
             print(
