@@ -81,10 +81,9 @@ class Constraints:
             within = self.outline.buffer(TOUCH)
             for electrode in design.electrodes:
                 for facet in electrode.surface.facets:
-                    outside = shapely.get_coordinates(facet.footprint.difference(within))
-                    if len(outside):
-                        over = 1e3 * shapely.distance(self.outline, shapely.points(outside)).max()
-                        return f"electrode {electrode.name!r} is {over:.3g} mm over the outline"
+                    if not within.covers(facet.footprint):
+                        outside = 1e6 * facet.footprint.difference(self.outline).area
+                        return f"electrode {electrode.name!r} has {outside:.3g} mm² outside the outline"
         return ""
 
     def __bool__(self) -> bool:

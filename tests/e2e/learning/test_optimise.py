@@ -173,8 +173,8 @@ def test_constraints_of_shapes(task_file: Path) -> None:
         ({"A": (area, area), "all": (both, both)}, box, ""),
         ({"B": (1.01 * area, 1.0)}, None, "area of B is 2.5e-05 m², below its limit of 2.525e-05"),
         ({"all": (0.0, 0.9 * both)}, None, "area of all is 5e-05 m², above"),
-        ({}, box.buffer(-0.001, join_style="mitre"), "'A' is 1.41 mm over"),
-        ({}, notch, "'B' is 0.4 mm over"),
+        ({}, box.buffer(-0.001, join_style="mitre"), "'A' has 13 mm² outside"),
+        ({}, notch, "'B' has 2 mm² outside"),
     ):
         found = Constraints(areas, outline).violation(design)
         assert why in found
@@ -244,7 +244,7 @@ def test_bounds_of_a_task(task_file: Path) -> None:
             "[constraints]\narea = { all = { max = 49e-6 } }\n[design]",
             "start breaks a constraint: area of all is 5e-05",
         ),
-        ("[design]", "[constraints]\noutline = [0.05, 0.01]\n[design]", "'A' is 5 mm over"),
+        ("[design]", "[constraints]\noutline = [0.05, 0.01]\n[design]", "'A' has 25 mm² outside"),
         ("[design]", "[constraints]\nclearance = 0.01\n[design]", "add outline"),
         ("[design]", "[constraints]\nclearance = 0.01\noutline = [0.1, 0.02]\n[design]", "nothing"),
         ("[design]", "[constraints]\narea = { C = { max = 1 } }\n[design]", "no electrode"),
