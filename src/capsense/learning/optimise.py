@@ -82,8 +82,8 @@ class Constraints:
             for electrode in design.electrodes:
                 for facet in electrode.surface.facets:
                     if not within.covers(facet.footprint):
-                        outside = 1e6 * facet.footprint.difference(self.outline).area
-                        return f"electrode {electrode.name!r} has {outside:.3g} mm² outside the outline"
+                        over = 1e6 * facet.footprint.difference(self.outline).area
+                        return f"electrode {electrode.name!r} has {over:.3g} mm² outside the outline"
         return ""
 
     def __bool__(self) -> bool:
