@@ -83,7 +83,9 @@ class Constraints:
                 for facet in electrode.surface.facets:
                     if not within.covers(facet.footprint):
                         over = 1e6 * facet.footprint.difference(self.outline).area
-                        return f"electrode {electrode.name!r} has {over:.3g} mm² outside the outline"
+                        return (
+                            f"electrode {electrode.name!r} has {over:.3g} mm² outside the outline"
+                        )
         return ""
 
     def __bool__(self) -> bool:
