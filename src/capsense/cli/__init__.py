@@ -119,12 +119,13 @@ def check_picture(option: str, path: Path, error: type[CapSenseError]) -> None:
         raise error(f"{option} {path}: there is no folder {path.parent}; make it first")
 
 
-def check_target(option: str, path: Path, ending: str, error: type[CapSenseError]) -> None:
+def check_target(
+    option: str, path: Path, ending: str | tuple[str, ...], error: type[CapSenseError]
+) -> None:
     """Refuse before any computation what could not be written after it."""
-    if path.suffix.lower() != ending or not path.parent.is_dir():
-        raise error(
-            f"{option} {path}: give a name that ends in {ending}, in a folder that is there"
-        )
+    if not path.name.lower().endswith(ending) or not path.parent.is_dir():
+        known = ending if isinstance(ending, str) else " or ".join(ending)
+        raise error(f"{option} {path}: give a name that ends in {known}, in a folder that is there")
 
 
 class Interrupt:

@@ -35,7 +35,7 @@ from capsense.reproduce import STUDIES, load_study
 if TYPE_CHECKING:
     from capsense.learning.optimise import Bound, DesignTask
     from capsense.reproduce.harness import Study
-    from capsense.studies import Capacitances, StudyRow
+    from capsense.studies import Capacitances, Evaluation, StudyRow
     from capsense.studies.tolerances import Tolerances
 
 
@@ -257,42 +257,69 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:shown])} and {len(names) - shown} more files"
 
 
-_JOBS = arg("--jobs N", "processes (default: 1)", type=count_of, default=1)
+_TABLES = (".csv", ".parquet")
+_JOBS = arg(
+    "--jobs N", "processes (default: all processors, fewer where memory is short)", type=count_of
+)
 
 
 @command(
     "sweep",
-    "capacitances of a design over a grid of its parameters",
-    arg("design DESIGN.toml", "a design whose file has expressions of parameters", type=Path),
+    "capacitances and counts over a grid of any numbers of a sensor",
+    arg("design DESIGN", "a design's file, or the name of a packaged one"),
     arg(
         "--vary NAME=VALUES",
-        "a parameter: FROM:TO:COUNT or A,B,C, with units mm, cm, m, in; give it once for each one",
+        "a parameter or a key, electrode.E1.size.x: FROM:TO:COUNT or A,B,C; once for each one",
         action="append",
         required=True,
     ),
-    arg("-o --output TABLE.csv", "rows are appended as they finish", type=Path, required=True),
+    arg(
+        "-o --output TABLE",
+        ".csv or .parquet; rows are kept as they finish",
+        type=Path,
+        required=True,
+    ),
     arg("--scenario FILE.toml", "bodies, as they stand at time 0", type=Path),
+    arg("--readout CHIP", "counts of a chip, by its name or a readout file; without noise"),
+    arg(
+        "--derivatives NAME[=STEP]",
+        "also derivatives by this parameter, with errors; once for each one",
+        action="append",
+        default=[],
+    ),
+    arg("--plot FILE", "plot over one or two parameters: .png, .svg or .pdf", type=Path),
+    arg("--outputs NAMES", "what to plot, such as C0_E1_E1,C0_E1_E2 or dC", default=""),
     _JOBS,
     QUIET,
 )
 def sweep(args: argparse.Namespace) -> int:
-    """Compute the capacitances of the empty domain for all combinations of the parameters, and what
-    the bodies of a scenario change. In DESIGN.toml, a text such as "=side / 2" is an expression.
-    What it will cost is said first. A point whose design cannot be made has an error in the table.
+    """Compute the capacitances of the empty domain for all combinations of values, with a scenario
+    what its bodies change, and with a chip the counts. NAME is a dotted key of the design, the
+    scenario or the readout, such as body.finger.pose.position.z, or a parameter that a text such as
+    "=side / 2" in any of the files uses. VALUES have units (mm, cm, m, in, pF, fF) or are in SI
+    units; a key may also be given texts, such as materials. What it will cost is said first. A
+    point of which nothing can be made has an error in the table.
 
-    After an interruption, run the same command: what TABLE.csv holds is not computed again, and the
+    After an interruption, run the same command: what TABLE holds is not computed again, and the
     table is the same in the end. More values may be added in the same way.
 
     examples:
-      capsense sweep pad.toml --vary side=10mm:30mm:5 -o pad.csv
-      capsense sweep pad.toml --vary side=10mm,20mm --vary gap=1mm:3mm:3 -o pad.csv --jobs 2
-      capsense sweep pad.toml --vary side=0.01,0.02 --scenario finger.toml -o pad.csv
+      capsense sweep six_patch --vary electrode.E1.size.x=20mm:30mm:5 -o patch.csv
+      capsense sweep pad.toml --vary side=10mm,20mm --vary gap=1mm:3mm:3 -o pad.csv --plot pad.png
+      capsense sweep pad.toml --vary side=0.01 -o pad.csv --derivatives side
+      capsense sweep patch --scenario a.toml --readout fdc1004 --vary wiring.trace=0,5pF -o t.csv
     """
     from capsense.studies import Capacitances
-    from capsense.studies.sweeps import grid, load_template, parse_vary
+    from capsense.studies.capacitances import (
+        load_design_template,
+        load_readout_template,
+        load_scenario_template,
+    )
+    from capsense.studies.plots import check_plot, plot_sweep
+    from capsense.studies.sweeps import grid, parse_steps, parse_vary, with_derivatives
 
-    check_target("--output", args.output, ".csv", ScenarioError)
-    vary: dict[str, list[float]] = {}
+    _check_files(args)
+    vary: dict[str, list[Any]] = {}
     for text in args.vary:
         name, values = parse_vary(text)
         if name in vary:
@@ -302,67 +329,104 @@ def sweep(args: argparse.Namespace) -> int:
         points = grid(vary)
     except ValueError as error:
         raise ScenarioError(f"--vary: {error}") from None
-    template, folder = load_template(args.design)
-    evaluation = Capacitances.of(args.design.name, template, folder, points, args.scenario)
-    rows = _fill(args, points, evaluation)
+    capacitances = Capacitances.of(
+        load_design_template(args.design), points,
+        None if args.scenario is None else load_scenario_template(args.scenario),
+        None if args.readout is None else load_readout_template(args.readout),
+    )  # fmt: skip
+    steps = parse_steps(args.derivatives)
+    evaluation = with_derivatives(capacitances, steps, points)
+    chosen = [name for name in args.outputs.split(",") if name]
+    if args.plot is not None:
+        check_plot(points, evaluation.outputs, chosen)
+    elif chosen:
+        raise ScenarioError("--outputs chooses what --plot shows; give --plot FILE as well")
+    more = 6 * len(steps.keys() & capacitances.design.parameters)
+    rows = _fill(args, points, evaluation, capacitances, more)
+    if args.plot is not None:
+        plot_sweep(rows, evaluation.outputs, chosen).savefig(args.plot, dpi=150)
     if not args.quiet:
         print(f"{len(rows)} rows in {args.output}{_without_results(rows)}")
     return OK
 
 
+def _check_files(args: argparse.Namespace) -> None:
+    """Refuse tables and plots that could not be written."""
+    check_target("--output", args.output, _TABLES, ScenarioError)
+    if args.plot is not None:
+        check_picture("--plot", args.plot, ScenarioError)
+
+
 @command(
     "tolerance",
-    "how capacitances scatter with a design's parameters, and the yield",
-    arg("study STUDY.toml", "a design, what scatters, and specifications", type=Path),
-    arg("-o --output TABLE.csv", "samples, appended as they finish", type=Path, required=True),
+    "how capacitances and counts scatter with parameters, and the yield",
+    arg("study STUDY.toml", "a sensor, what scatters, and specifications", type=Path),
+    arg(
+        "-o --output TABLE",
+        ".csv or .parquet; samples are kept as they finish",
+        type=Path,
+        required=True,
+    ),
     arg("--plot FILE", "tornado plot: .png, .svg or .pdf", type=Path),
     _JOBS,
     QUIET,
 )
 def tolerance(args: argparse.Namespace) -> int:
-    """Draw quasi-random samples of a design's parameters, compute their capacitances, and print for
-    each output its mean and standard deviation, the parameters in the order of their effects with
-    their first-order contributions to the variance, and the yield with its 95 % interval.
+    """Draw quasi-random samples of the parameters of a design, of bodies and of a chip, compute
+    capacitances and counts, and print for each output its mean and standard deviation, the
+    parameters in the order of their effects with their first-order contributions to the variance,
+    and the yield with its 95 % interval.
 
-    After an interruption, run the same command: what TABLE.csv holds is not computed again.
+    After an interruption, run the same command: what TABLE holds is not computed again.
 
     examples:
       capsense tolerance study.toml -o samples.csv
-      capsense tolerance study.toml -o samples.csv --plot tornado.png --jobs 2
+      capsense tolerance study.toml -o samples.parquet --plot tornado.png --jobs 2
     """
-    from capsense.studies.tolerances import analyse, load_study, tornado
+    from capsense.studies.tolerances import analyse, load_study, narrowed, tornado
 
-    check_target("--output", args.output, ".csv", ScenarioError)
-    if args.plot is not None:
-        check_picture("--plot", args.plot, ScenarioError)
+    _check_files(args)
     study, evaluation = load_study(args.study)
-    rows = _fill(args, study.points, evaluation)
+    rows = _fill(args, study.points, evaluation, evaluation)
     found = analyse(rows, evaluation.outputs, study.specifications)
     if args.plot is not None:
-        tornado(found, list(study.specifications) or evaluation.outputs).savefig(args.plot)
+        shown = list(study.specifications) or evaluation.outputs
+        tornado(found, shown).savefig(args.plot, dpi=150)
     if not args.quiet:
         print(_tolerance_report(found))
+        if found.yields:
+            held = {
+                name: narrowed(found, study.specifications, {name: 0.0})["all"]
+                for name in study.parameters
+            }
+            lines = [
+                (name, f"{100 * y.share:.1f}", f"{100 * y.low:.1f} to {100 * y.high:.1f}")
+                for name, y in sorted(held.items(), key=lambda item: -item[1].share)
+            ]
+            print(f"\n{table(('without the scatter of', 'yield [%]', '95 % interval'), lines)}")
         print(f"\n{len(rows)} samples in {args.output}{_without_results(rows)}")
     return OK
 
 
 def _tolerance_report(found: Tolerances) -> str:
     """Scatter, ranking and yield as text; warns where the linear fit is poor."""
+    from capsense.studies.capacitances import unit_of_output
     from capsense.studies.tolerances import POOR_FIT
 
     lines = []
     for name, output in found.outputs.items():
+        factor, unit = unit_of_output(name)
         for number, (parameter, effect) in enumerate(output.effects.items()):
-            own = (name, f"{1e15 * output.mean:.4g}", f"{1e15 * output.deviation:.3g}")
+            own = (name, f"{factor * output.mean:.4g}", f"{factor * output.deviation:.3g}", unit)
             share = 100 * output.contributions[parameter]
             lines.append([
-                *(own if number == 0 else ("", "", "")), parameter, f"{1e15 * effect:+.3g}",
+                *(own if number == 0 else ("",) * 4), parameter, f"{factor * effect:+.3g}",
                 f"{share:.1f}",
             ])  # fmt: skip
         if output.explained < POOR_FIT:
             say(f"warning: {name}: a linear fit explains {100 * output.explained:.0f} % of the "
                 "variance only, so that contributions are incomplete; see the samples")  # fmt: skip
-    header = ("output", "mean [fF]", "deviation [fF]", "parameter", "effect [fF]", "share [%]")
+    header = ("output", "mean", "deviation", "unit", "parameter", "effect", "share [%]")
     parts = [table(header, lines)]
     if found.yields:
         rows = [
@@ -380,23 +444,38 @@ def _without_results(rows: list[StudyRow]) -> str:
     return f"; {wrong} without results, see column error" if wrong else ""
 
 
-def _fill(args: argparse.Namespace, points: list[Any], evaluation: Capacitances) -> list[StudyRow]:
-    """Evaluate points into the table ``args.output``: the cost first, then progress."""
-    from capsense.studies.points import fill_table, missing
-    from capsense.studies.sweeps import cost_of
+def _fill(
+    args: argparse.Namespace, points: list[Any], evaluation: Evaluation, made: Capacitances,
+    more: int = 0,
+) -> list[StudyRow]:  # fmt: skip
+    """Evaluate points into the table ``args.output``: the cost first, then progress.
+
+    Args:
+        args: Of the command.
+        points: Values of the parameters.
+        evaluation: What is computed.
+        made: What it is computed with, for its cost.
+        more: Further designs of each point, for derivatives.
+    """
+    from capsense.studies.points import fill_table, jobs_within, journal_of, missing
 
     todo = missing(points, evaluation, args.output)
-    if todo and not args.quiet:
-        panels, each = cost_of(evaluation, todo)
+    jobs = args.jobs or 1
+    if todo:
+        cost = made.cost(todo)
+        jobs = args.jobs or jobs_within(cost.memory)
         done = len(points) - len(todo)
         kept = f", {done} more are kept or cannot be made" if done else ""
-        say(f"{len(todo)} designs of about {grouped(panels)} panels{kept}: about "
-            f"{_duration(each * len(todo))} of a processor's time")  # fmt: skip
+        if not args.quiet:
+            time = _duration(cost.time * (1 + more))
+            field = f": about {time} of a processor's time" if cost.time else ", its field is there"
+            say(f"{len(todo)} points{kept}; {cost.designs} designs of about "
+                f"{grouped(cost.panels)} panels{field}")  # fmt: skip
     try:
-        with Progress(len(todo), "designs", quiet=args.quiet) as progress:
-            return fill_table(points, evaluation, args.output, jobs=args.jobs, each=progress)
+        with Progress(len(todo), "points", quiet=args.quiet) as progress:
+            return fill_table(points, evaluation, args.output, jobs=jobs, each=progress)
     except KeyboardInterrupt:
-        say(f"what was computed is kept in {args.output}; run it again to go on")
+        say(f"what was computed is kept in {journal_of(args.output)}; run it again to go on")
         raise
 
 

@@ -115,21 +115,42 @@ def build_background(
         else:
             tell(stage, _STAGES.get(stage, 0.0))
 
-    names, unit, name = tuple(terminals(design)), design.unit, design.name
-    design = design.in_units
-    solution = BoundarySolution(design, Accuracy(settings.panel_scale), begin)
-    densities = solution.densities(np.eye(len(names)))
-    capacitance = solution.terminal_charges(densities)
-    capacitance = 0.5 * unit * (capacitance + capacitance.T)
-    if not (np.isfinite(densities).all() and np.isfinite(capacitance).all()):
-        raise FieldError(f"the background field of design {name!r} is not finite")
+    names, unit = tuple(terminals(design)), design.unit
+    solution, densities, capacitance = _solve_empty(design, settings, begin)
     green = build_green(solution, densities, begin)
-    if has_even_face(design):
+    if has_even_face(solution.design):
         table = gap_table_of(solution, settings.panel_scale, green, begin)
         green = replace(green, gap=table)
     green = replace(green, unit=unit)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)
+
+
+def empty_capacitance(design: Design, settings: BuildSettings | None = None) -> Array:
+    """Maxwell matrix of a design's empty domain alone, as :func:`build_background` has it [F].
+
+    It takes boundary elements, and none of the rest of a field: no bodies can be solved with it.
+
+    Returns:
+        Shape (terminals, terminals), to the last bit ``BackgroundField.capacitance``.
+
+    Raises:
+        FieldError: The geometry needs more panels than fit, or a result is not finite.
+    """
+    return _solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
+
+
+def _solve_empty(
+    design: Design, settings: BuildSettings, begin: Callable[[str], None]
+) -> tuple[BoundarySolution, Array, Array]:
+    """Boundary elements in the design's unit, their densities, and the Maxwell matrix [F]."""
+    solution = BoundarySolution(design.in_units, Accuracy(settings.panel_scale), begin)
+    densities = solution.densities(np.eye(solution.model.n_terminals))
+    capacitance = solution.terminal_charges(densities)
+    capacitance = 0.5 * design.unit * (capacitance + capacitance.T)
+    if not (np.isfinite(densities).all() and np.isfinite(capacitance).all()):
+        raise FieldError(f"the background field of design {design.name!r} is not finite")
+    return solution, densities, capacitance
 
 
 class Terminals:

@@ -273,6 +273,16 @@ def load_or_build(
     return replace(field, terminals=tuple(terminals(design)))
 
 
+def is_at_hand(key: str) -> bool:
+    """Whether the field of a key comes with the package, or is in the user's cache."""
+    shipped = shipped_dir()
+    names = [file.name for file in shipped.iterdir()] if shipped.is_dir() else []
+    return (
+        any(n.endswith(f"-{key}.npz") for n in names)
+        or (default_cache_dir() / f"{key}.npz").is_file()
+    )
+
+
 def load_shipped(key: str, folder: Traversable | None = None) -> BackgroundField | None:
     """Return the field that comes with the package for a key, if there is one."""
     folder = folder or shipped_dir()

@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-from capsense._validate import read_toml
+from capsense._validate import read_toml, suggest
 from capsense.design import Design, parse_design
+from capsense.design.geometry import TOUCH
 from capsense.errors import DesignError, FieldError, ScenarioError
 from capsense.field.background import BuildSettings, build_background
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator
@@ -32,10 +35,12 @@ Array = NDArray[np.float64]
 
 TOP_KEYS = (
     "name", "evaluations", "seed", "resolution", "noise", "relative", "matrix", "limb", "poses",
-    "one", "parameters", "design",
+    "one", "parameters", "constraints", "design",
 )  # fmt: skip
 _DIGITS = 6
 """Parameters and lengths are rounded to so many digits: a micrometre."""
+_ROUNDS = 20
+"""So many candidates for each evaluation may break constraints before the search ends."""
 
 
 class Span(NamedTuple):
@@ -53,6 +58,38 @@ class Bound(NamedTuple):
     """Of all four in the task's units, rms; infinite where the design cannot be made."""
     pose: LimbPose
     """Cramér–Rao bounds as standard deviations [m, m, rad, rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Constraints:
+    """What a design must keep to, whatever its bound."""
+
+    areas: Mapping[str, tuple[float, float]]
+    """Least and largest area [m²] of electrodes by name, and of all together under ``all``."""
+    outline: shapely.Polygon | None = None
+    """What all electrodes stay within, as seen along z [m]."""
+
+    def violation(self, design: Design) -> str:
+        """Which constraint a design breaks, and by how much; empty if it keeps to all."""
+        areas = {e.name: e.surface.area for e in design.electrodes}
+        areas["all"] = sum(areas.values())
+        for name, (least, most) in self.areas.items():
+            if not least * (1 - 1e-9) <= areas[name] <= most * (1 + 1e-9):
+                side, limit = ("below", least) if areas[name] < least else ("above", most)
+                return f"area of {name} is {areas[name]:.4g} m², {side} its limit of {limit:.4g} m²"
+        if self.outline is not None:
+            within = self.outline.buffer(TOUCH)
+            for electrode in design.electrodes:
+                for facet in electrode.surface.facets:
+                    if not within.covers(facet.footprint):
+                        over = 1e6 * facet.footprint.difference(self.outline).area
+                        return (
+                            f"electrode {electrode.name!r} has {over:.3g} mm² outside the outline"
+                        )
+        return ""
+
+    def __bool__(self) -> bool:
+        return bool(self.areas) or self.outline is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +118,7 @@ class DesignTask:
     """Of the fields during the search; 1 is full accuracy."""
     folder: Path
     """What the design names is relative to this folder."""
+    constraints: Constraints
 
     @property
     def start(self) -> Array:
@@ -130,14 +168,19 @@ class DesignTask:
         return Bound(cost, LimbPose(*np.sqrt(squares).tolist()))
 
 
+class _Spent(Exception):
+    """All evaluations are used up."""
+
+
 def search(
     task: DesignTask, each: Callable[[Array, Bound], None] = lambda values, bound: None
 ) -> tuple[Array, Bound]:
     """The best parameters found.
 
     The start, then points of a Latin hypercube, are tried; Nelder–Mead goes on from the best of
-    them with two thirds of all evaluations. What cannot be made costs an infinite amount. The same
-    task gives the same result.
+    them with two thirds of all evaluations. What cannot be made costs an infinite amount. What
+    breaks a constraint does so as well, but is not built, and is no evaluation. The same task gives
+    the same result.
 
     Args:
         task: What is to be found.
@@ -156,6 +199,10 @@ def search(
         known = [b for v, b in tried if np.array_equal(v, values)]
         if known:
             return known[0].cost
+        if tried and broken(values):
+            return math.inf
+        if len(tried) >= max(1, task.evaluations):
+            raise _Spent
         try:
             bound = task.bound(values)
         except (DesignError, FieldError):
@@ -166,20 +213,31 @@ def search(
         each(values, bound)
         return bound.cost
 
+    def broken(values: Array) -> bool:
+        try:
+            return bool(task.constraints.violation(task.design(values)))
+        except DesignError:
+            return False  # it is tried, and counts
+
     judge((task.start - low) / width)
-    points = qmc.LatinHypercube(len(low), rng=np.random.default_rng(task.seed))
-    for share in points.random(max(0, task.evaluations // 3 - 1)):
-        judge(share)
+    sampler = qmc.LatinHypercube(len(low), rng=np.random.default_rng(task.seed))
+    first = task.evaluations // 3
+    for _ in range(_ROUNDS):
+        for share in sampler.random(max(0, first - 1)):
+            if len(tried) < first:
+                judge(share)
     best = min(tried, key=lambda pair: pair[1].cost)[0]
     left = task.evaluations - len(tried)
     if left > 0:  # of the simplex, one corner is known
         origin = (best - low) / width
         corners = origin + np.where(origin > 0.5, -0.15, 0.15)[:, None] * np.eye(len(low))
-        minimize(
-            judge, origin, method="Nelder-Mead", bounds=[(0.0, 1.0)] * len(low),
-            options={"maxfev": left + 1, "initial_simplex": np.vstack([origin, corners]),
-                     "xatol": 1e-3, "fatol": 1e-4},
-        )  # fmt: skip
+        allowed = (left + 1) * (_ROUNDS if task.constraints else 1)
+        with suppress(_Spent):
+            minimize(
+                judge, origin, method="Nelder-Mead", bounds=[(0.0, 1.0)] * len(low),
+                options={"maxfev": allowed, "initial_simplex": np.vstack([origin, corners]),
+                         "xatol": 1e-3, "fatol": 1e-4},
+            )  # fmt: skip
     return min(tried, key=lambda pair: pair[1].cost)
 
 
@@ -206,7 +264,8 @@ def load_task(path: str | Path) -> DesignTask:
 
     Raises:
         ScenarioError: There is no such file, or anything in it is wrong.
-        DesignError: An expression of the design is wrong, or the start cannot be made.
+        DesignError: An expression of the design is wrong, or the start cannot be made or breaks a
+            constraint.
     """
     file = Path(path)
     top = Table(read_toml(file, "task", ScenarioError), file.name, "task")
@@ -240,9 +299,46 @@ def load_task(path: str | Path) -> DesignTask:
         evaluations=top.integer("evaluations", 1, 10**5, 60),
         seed=top.integer("seed", 0, 2**63 - 1, 0),
         resolution=top.number("resolution", 0.25, 4.0, 0.25), folder=file.resolve().parent,
+        constraints=Constraints({}),
     )  # fmt: skip
-    task.design(task.start)
+    start = task.design(task.start)
+    if "constraints" in top:
+        limits = part("constraints", ("area", "outline", "clearance"))
+        task = replace(task, constraints=_constraints(limits, start.electrode_names))
+    if broken := task.constraints.violation(start):
+        raise top.error(f"the start breaks a constraint: {broken}; change start = …, or the limit")
     return task
+
+
+def _constraints(table: Table, electrodes: Sequence[str]) -> Constraints:
+    """Limits of areas, and the outline."""
+    areas = {}
+    given = Table(table.data.get("area", {}), table.source, "constraints: area")
+    names = [*electrodes, "all"]
+    for name in given.data:
+        if name not in names:
+            raise given.error(f"{name!r} is no electrode; {suggest(name, names)}")
+        one = Table(given.data[name], table.source, f"constraints: area of {name}")
+        one.only(("min", "max"))
+        least = one.number("min", 0.0, 1e2, 0.0, unit="m²")
+        most = one.number("max", least, 1e2, math.inf, unit="m²")
+        areas[name] = (least, most)
+    if "outline" not in table:
+        if "clearance" in table:
+            raise table.error("clearance is kept from an outline, and there is none; add outline")
+        return Constraints(areas)
+    value = table.raw("outline", "[width, height], or a list of [x, y] points in metres")
+    if isinstance(value, list) and value and not isinstance(value[0], list):
+        width, height = table.sizes("outline", 2, "[width, height] in metres")
+        outline = shapely.box(-width / 2, -height / 2, width / 2, height / 2)
+    else:
+        outline = shapely.Polygon(table.points("outline", 3))
+    if not outline.is_valid:
+        raise table.error("outline crosses itself; give its corners in order")
+    within = outline.buffer(-table.length("clearance", 0.0, zero=True), join_style="mitre")
+    if not isinstance(within, shapely.Polygon) or within.is_empty:
+        raise table.error("clearance leaves nothing of the outline in one piece; reduce it")
+    return Constraints(areas, within)
 
 
 def to_toml(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> str:

@@ -1,183 +1,100 @@
-"""Sweeps: capacitances of a design over a grid of its parameters."""
+"""Sweeps: capacitances and counts over a grid of parameters."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from capsense._validate import UNITS, read_toml, suggest
-from capsense.design import Design, parse_design
-from capsense.errors import DesignError, ScenarioError
-from capsense.field.background import build_background
-from capsense.field.boundary import Accuracy, build_cost, build_model
-from capsense.field.cache import cache_key, default_settings
-from capsense.scenario import load_scenario
-from capsense.scenario.model import Excitation, channels_of, read_channels
-from capsense.simulator import Simulator
-from capsense.studies.points import Evaluation, Point, StudyRow, fill_table
-from capsense.studies.template import fill, names_in
+from capsense._validate import UNITS
+from capsense.errors import ScenarioError
+from capsense.studies.capacitances import (
+    Capacitances,
+    load_design_template,
+    load_readout_template,
+    load_scenario_template,
+)
+from capsense.studies.points import Evaluation, StudyRow, fill_table, jobs_within
+from capsense.studies.slopes import WithDerivatives
+from capsense.studies.template import Point, Value
 
 MAX_POINTS = 100_000
 """A study of more points is refused."""
-
-
-@dataclass(frozen=True)
-class Capacitances:
-    """Maxwell matrices of a design for values of its parameters; an :class:`Evaluation`.
-
-    The outputs are the upper triangle of the matrix in the empty domain (``C0_E1_E2``) [F] and,
-    with a scenario, its change by the bodies as they stand at time 0 (``dC_E1_E2``) [F].
-    """
-
-    name: str
-    """Name of the design's file, for messages."""
-    template: Mapping[str, Any]
-    """A design's file, with expressions of the parameters."""
-    folder: Path
-    """What the design names is relative to this folder."""
-    electrodes: tuple[str, ...]
-    """Names of the electrodes in matrix order."""
-    scenario: Path | None = None
-    """Where the bodies are from; its design and its motion are not used."""
-
-    @classmethod
-    def of(
-        cls,
-        name: str,
-        template: Mapping[str, Any],
-        folder: Path,
-        points: Sequence[Point],
-        scenario: Path | None = None,
-    ) -> Capacitances:
-        """Check a template and take the electrodes from the first point that has a design.
-
-        Raises:
-            DesignError: No point has a design, or a parameter is not used.
-            ScenarioError: The scenario is wrong.
-        """
-        used = names_in(template)
-        for parameter in points[0]:
-            if parameter not in used:
-                known = suggest(parameter, sorted(used)) if used else "the design has no expression"
-                raise DesignError(
-                    f'{name}: no expression uses {parameter!r}; {known}; write "={parameter}" in '
-                    "place of the number that is to vary"
-                )
-        if scenario is not None:
-            load_scenario(scenario)
-        first: DesignError | None = None
-        for point in points:
-            try:
-                design = cls(name, template, folder, ()).design(point)
-            except DesignError as error:
-                first = first or error
-            else:
-                return cls(name, template, folder, design.electrode_names, scenario)
-        assert first is not None
-        raise first
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the results."""
-        names = [c.column_name[1:] for c in channels_of(Excitation.MATRIX, self.electrodes)]
-        kinds = ("C0",) if self.scenario is None else ("C0", "dC")
-        return tuple(kind + name for kind in kinds for name in names)
-
-    def design(self, point: Point) -> Design:
-        """The design for values of the parameters.
-
-        Raises:
-            DesignError: It cannot be made: electrodes touch, say.
-        """
-        return parse_design(fill(self.template, point), source=self.name, folder=self.folder)
-
-    def key(self, point: Point) -> str:
-        """Digest of the design and of the scenario's file."""
-        design = self.design(point)
-        scenario = b"" if self.scenario is None else self.scenario.read_bytes()
-        text = cache_key(design, default_settings(design)).encode() + scenario
-        return hashlib.sha256(text).hexdigest()[:16]
-
-    def panels(self, point: Point) -> int:
-        """Size of the boundary-element system, which the time to build a field depends on."""
-        design = self.design(point)
-        accuracy = Accuracy(default_settings(design).panel_scale)
-        return build_model(design.in_units, accuracy).panels.size
-
-    def __call__(self, point: Point) -> tuple[float, ...]:
-        """Build the field, and solve the scene if there is one."""
-        design = self.design(point)
-        settings = default_settings(design)
-        field = build_background(design, settings)
-        sim = Simulator(design, settings=settings, background=field)
-        channels = channels_of(Excitation.MATRIX, self.electrodes)
-        empty = read_channels(channels, sim.empty)
-        if self.scenario is None:
-            return tuple(empty.tolist())
-        reading = sim.step(load_scenario(self.scenario).scene_at(0.0))
-        return (*empty.tolist(), *(read_channels(channels, reading) - empty).tolist())
-
-
-def load_template(path: str | Path) -> tuple[dict[str, Any], Path]:
-    """A design's file with expressions, and its folder.
-
-    Raises:
-        DesignError: There is no such file, or it is not TOML.
-    """
-    file = Path(path)
-    return read_toml(file, "design", DesignError), file.resolve().parent
+QUANTITIES = {**UNITS, "pF": 1e-12, "fF": 1e-15}
+"""Units of values."""
 
 
 def sweep(
     design: str | Path,
-    vary: Mapping[str, Sequence[float]],
+    vary: Mapping[str, Sequence[Value]],
     output: str | Path,
     *,
     scenario: str | Path | None = None,
-    jobs: int = 1,
+    readout: str | Path | None = None,
+    derivatives: Mapping[str, float | None] | None = None,
+    jobs: int | None = None,
     each: Callable[[int], object] = lambda count: None,
-    evaluation: Evaluation | None = None,
 ) -> list[StudyRow]:
-    """Capacitances of a design over a grid of its parameters.
+    """Capacitances and counts of a sensor over a grid of its parameters.
 
-    Rows are appended to a CSV file as they finish. A sweep that was interrupted goes on where it
+    Rows are appended to a file as they finish. A sweep that was interrupted goes on where it
     stopped if it is started again with the same file.
 
     Args:
-        design: A design's file in which texts such as ``"=side / 2"`` are expressions.
+        design: A design's file in which texts such as ``"=side / 2"`` may be expressions, or the
+            name of a packaged design.
         vary: Values of each parameter, in SI units; all combinations are computed, the last
-            parameter changing fastest.
-        output: The CSV file: parameters, capacitances [F], error, key.
+            parameter changing fastest. A parameter is a name that expressions in the files use, or
+            a dotted key, such as ``electrode.E1.size.x`` or ``body.finger.material``.
+        output: The table, CSV or Parquet by its name: parameters, capacitances [F], counts, error,
+            key.
         scenario: A scenario's file, whose bodies as they stand at time 0 change the capacitances.
-        jobs: Processes.
+        readout: A readout's file, or the name of a chip, for counts without noise.
+        derivatives: Parameters by which derivatives are given too, and the largest step of each, as
+            :func:`derivatives` takes it; None for a twentieth of the value.
+        jobs: Processes; by default one a processor, fewer where memory is short.
         each: Called with 1 for each result as it is appended.
-        evaluation: What to compute in place of capacitances; ``design`` is then not read.
 
     Returns:
-        A row for each point. A point whose design cannot be made has an error and no results.
+        A row for each point. A point of which nothing can be made has an error and no results.
 
     Raises:
-        DesignError: No point has a design, or a parameter is not used.
+        DesignError: The design is wrong, or a parameter is not used.
         ScenarioError: The scenario is wrong, or the file is of another sweep.
+        ReadoutError: The readout is wrong.
+        CapSenseError: Nothing can be made of any point.
         ValueError: There are no points, or too many.
     """
     points = grid(vary)
-    if evaluation is None:
-        template, folder = load_template(design)
-        bodies = None if scenario is None else Path(scenario)
-        evaluation = Capacitances.of(Path(design).name, template, folder, points, bodies)
-    return fill_table(points, evaluation, Path(output), jobs=jobs, each=each)
+    evaluation = Capacitances.of(
+        load_design_template(design),
+        points,
+        None if scenario is None else load_scenario_template(scenario),
+        None if readout is None else load_readout_template(readout),
+    )
+    jobs = jobs or jobs_within(evaluation.cost(points).memory)
+    return fill_table(
+        points, with_derivatives(evaluation, derivatives, points), Path(output), jobs=jobs,
+        each=each,
+    )  # fmt: skip
 
 
-def grid(vary: Mapping[str, Sequence[float]]) -> list[dict[str, float]]:
+def with_derivatives(
+    evaluation: Evaluation, steps: Mapping[str, float | None] | None, points: Sequence[Point]
+) -> Evaluation:
+    """An evaluation that gives derivatives as well, if there are steps for some.
+
+    Raises:
+        ScenarioError: A step is wrong.
+    """
+    return WithDerivatives.of(evaluation, steps, points) if steps else evaluation
+
+
+def grid(vary: Mapping[str, Sequence[Value]]) -> list[dict[str, Value]]:
     """All combinations of values, the last parameter changing fastest.
 
     Raises:
@@ -189,49 +106,63 @@ def grid(vary: Mapping[str, Sequence[float]]) -> list[dict[str, float]]:
     return [dict(zip(vary, values, strict=True)) for values in product(*vary.values())]
 
 
-def parse_vary(text: str) -> tuple[str, list[float]]:
-    """``NAME=FROM:TO:COUNT`` or ``NAME=A,B,C``; numbers may have a unit, as in ``5mm``.
+def parse_vary(text: str) -> tuple[str, list[Value]]:
+    """``NAME=FROM:TO:COUNT`` or ``NAME=A,B,C``; numbers may have a unit, as in ``5mm``, and texts
+    stand for themselves.
 
     Raises:
         ScenarioError: It is something else.
     """
     name, _, values = text.partition("=")
-    if not name.isidentifier() or not values:
+    if not re.fullmatch(r"[^\W\d]\w*(\.[^.\s]+)*", name) or not values:
         raise ScenarioError(f"--vary {text}: write NAME=FROM:TO:COUNT or NAME=A,B,C")
     if ":" not in values:
-        return name, [_quantity(text, v) for v in values.split(",")]
+        return name, [_value(text, v.strip()) for v in values.split(",")]
     parts = values.split(":")
     if len(parts) != 3 or not re.fullmatch(r"\d{1,6}", parts[2]) or int(parts[2]) < 2:
         raise ScenarioError(f"--vary {text}: write NAME=FROM:TO:COUNT with a COUNT of 2 or more")
-    low, high = (_quantity(text, p) for p in parts[:2])
+    low, high = (quantity(f"--vary {text}", p) for p in parts[:2])
     return name, np.linspace(low, high, int(parts[2])).tolist()
 
 
-def _quantity(text: str, value: str) -> float:
+def parse_steps(texts: Sequence[str]) -> dict[str, float | None]:
+    """``NAME`` or ``NAME=STEP`` of parameters by which derivatives are taken.
+
+    Raises:
+        ScenarioError: One is something else, or a name is given twice.
+    """
+    out: dict[str, float | None] = {}
+    for text in texts:
+        name, given, step = text.partition("=")
+        if name in out:
+            raise ScenarioError(f"--derivatives {text}: {name} is given twice; keep one")
+        out[name] = quantity(f"--derivatives {text}", step) if given else None
+    return out
+
+
+def _value(text: str, value: str) -> Value:
+    """A number, or a text that cannot be a number that was mistyped."""
+    word = re.fullmatch(r"[^\W\d][\w .-]*", value)
+    if word and value not in QUANTITIES and value.lower() not in ("nan", "inf", "infinity"):
+        return value
+    return quantity(f"--vary {text}", value)
+
+
+def quantity(where: str, value: str) -> float:
+    """A number with or without a unit, in SI units.
+
+    Raises:
+        ScenarioError: It is something else; the message begins with ``where`` it is.
+    """
     found = re.fullmatch(r"\s*([-+.\deE]+?)\s*([a-zA-Z]*)\s*", value)
     unit = found[2] if found else ""
     try:
         number = float(found[1]) if found else math.nan
     except ValueError:
         number = math.nan
-    if not math.isfinite(number) or (unit and unit not in UNITS):
+    if not math.isfinite(number) or (unit and unit not in QUANTITIES):
         raise ScenarioError(
-            f"--vary {text}: {value!r} is no number; write one like 0.005 or 5mm, with a unit of "
-            f"{', '.join(UNITS)}"
+            f"{where}: {value!r} is no number; write one like 0.005 or 5mm, with a unit of "
+            f"{', '.join(QUANTITIES)}"
         )
-    return number * UNITS[unit] if unit else number
-
-
-def cost_of(evaluation: Capacitances, points: Sequence[Point]) -> tuple[int, float]:
-    """Panels [count] and estimated processor time [s] of a field, the mean of the first and last
-    point that have designs."""
-    counts = []
-    for order in (points, points[::-1]):
-        for point in order:
-            try:
-                counts.append(evaluation.panels(point))
-                break
-            except DesignError:
-                continue
-    panels = round(sum(counts) / len(counts))
-    return panels, build_cost(panels)[0]
+    return number * QUANTITIES[unit] if unit else number

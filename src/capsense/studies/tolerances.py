@@ -1,9 +1,9 @@
-"""Tolerances: how capacitances scatter with a design's parameters, and how many sensors pass."""
+"""Tolerances: how capacitances and counts scatter with parameters, and how many sensors pass."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -12,17 +12,27 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest, norm, qmc, triang
 
 from capsense._validate import read_toml, suggest
-from capsense.errors import ScenarioError
+from capsense.errors import CapSenseError, DesignError, ReadoutError, ScenarioError
 from capsense.scenario import ScenarioTable as Table
-from capsense.studies.points import Evaluation, StudyRow, fill_table
-from capsense.studies.sweeps import Capacitances
+from capsense.studies.capacitances import (
+    Capacitances,
+    is_code,
+    load_design_template,
+    load_readout_template,
+    load_scenario_template,
+    unit_of_output,
+)
+from capsense.studies.points import Evaluation, StudyRow, fill_table, jobs_within
+from capsense.studies.template import Template
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
-TOP_KEYS = ("name", "samples", "seed", "scenario", "parameters", "specifications", "design")
+TOP_KEYS = (
+    "name", "samples", "seed", "parameters", "specifications", "design", "scenario", "readout",
+)  # fmt: skip
 KINDS = {
     "normal": ("mean", "sigma"),
     "uniform": ("from", "to"),
@@ -44,6 +54,16 @@ class Distribution(NamedTuple):
     peak: float = 0.0
     """The most likely value of a triangular distribution."""
 
+    @property
+    def deviation(self) -> float:
+        """Standard deviation."""
+        if self.kind == "normal":
+            return self.second
+        width = self.second - self.first
+        if self.kind == "uniform":
+            return float(width / np.sqrt(12.0))
+        return float(triang.std((self.peak - self.first) / width, scale=width))
+
     def values(self, shares: Array) -> Array:
         """Quantiles of shares in (0, 1)."""
         width = self.second - self.first
@@ -55,7 +75,7 @@ class Distribution(NamedTuple):
 
 
 class Specification(NamedTuple):
-    """What an output may be [F]."""
+    """What an output may be, in F or codes."""
 
     least: float
     most: float
@@ -124,7 +144,9 @@ class Tolerances:
     """For each specification, and for all together under ``all``; empty without specifications.
     Samples without results do not pass."""
     without_results: int
-    """Samples whose design cannot be made."""
+    """Samples of which nothing can be made."""
+    rows: tuple[StudyRow, ...] = field(repr=False)
+    """The samples."""
 
 
 def tolerance(
@@ -132,17 +154,28 @@ def tolerance(
     evaluation: Evaluation,
     output: str | Path,
     *,
-    jobs: int = 1,
+    jobs: int | None = None,
     each: Callable[[int], object] = lambda count: None,
 ) -> Tolerances:
-    """Evaluate the samples of a study into a CSV file, as :func:`~capsense.studies.sweep` does, and
+    """Evaluate the samples of a study into a table, as :func:`~capsense.studies.sweep` does, and
     analyse them.
 
+    Args:
+        study: What scatters and what must hold, of :func:`~capsense.studies.load_study`.
+        evaluation: What is computed, of the same.
+        output: The table, CSV or Parquet by its name.
+        jobs: Processes; by default one a processor, fewer where memory is short.
+        each: Called with 1 for each result as it is appended.
+
     Raises:
-        DesignError: No sample has a design.
+        CapSenseError: Nothing can be made of any sample.
         ScenarioError: The file is of another study, or too few samples have results.
     """
-    rows = fill_table(study.points, evaluation, Path(output), jobs=jobs, each=each)
+    points = study.points
+    if jobs is None:
+        memory = evaluation.cost(points).memory if isinstance(evaluation, Capacitances) else 1.0
+        jobs = jobs_within(memory)
+    rows = fill_table(points, evaluation, Path(output), jobs=jobs, each=each)
     return analyse(rows, evaluation.outputs, study.specifications)
 
 
@@ -154,6 +187,35 @@ def analyse(
     Raises:
         ScenarioError: Too few samples have results for a linear fit.
     """
+    x, y = _samples(rows)
+    found = {name: _output(list(rows[0].point), x, y[:, k]) for k, name in enumerate(outputs)}
+    yields = _yields(y, outputs, specifications, len(rows))
+    return Tolerances(found, yields, len(rows) - len(y), tuple(rows))
+
+
+def narrowed(
+    found: Tolerances, specifications: Mapping[str, Specification], factors: Mapping[str, float]
+) -> dict[str, Yield]:
+    """Yields of the same samples if some parameters scattered less: what a tighter tolerance gives.
+
+    Each output is moved along its linear fit; what the fit does not explain stays.
+
+    Args:
+        found: Of the samples as they are.
+        specifications: What must hold.
+        factors: Of some parameters, the new standard deviation over the present one: 0.5 halves it,
+            0 holds the parameter at its mean.
+    """
+    x, y = _samples(found.rows)
+    away = _scaled(x)
+    slopes = np.linalg.lstsq(away, y - y.mean(axis=0), rcond=None)[0]
+    less = np.array([factors.get(name, 1.0) - 1.0 for name in found.rows[0].point])
+    moved = y + (away * less) @ slopes
+    return _yields(moved, list(found.outputs), specifications, len(found.rows))
+
+
+def _samples(rows: Sequence[StudyRow]) -> tuple[Array, Array]:
+    """Parameters and results of the samples that have results, (n, parameters), (n, outputs)."""
     good = [row for row in rows if not row.error]
     names = list(rows[0].point)
     if len(good) < len(names) + 2:
@@ -161,24 +223,32 @@ def analyse(
             f"{len(good)} samples have results, too few for a linear fit of {len(names)} "
             f"parameters; give more than {len(names) + 1}"
         )
-    x = np.array([list(row.point.values()) for row in good])
-    y = np.array([row.results for row in good])
-    found = {name: _output(names, x, y[:, k]) for k, name in enumerate(outputs)}
-    passed = {
-        name: (y[:, list(outputs).index(name)] >= limits.least)
-        & (y[:, list(outputs).index(name)] <= limits.most)
-        for name, limits in specifications.items()
-    }
+    x = np.array([list(row.point.values()) for row in good], dtype=float)
+    return x, np.array([row.results for row in good])
+
+
+def _scaled(x: Array) -> Array:
+    """Parameters from their means, in standard deviations."""
+    deviations = x.std(axis=0)
+    return np.asarray((x - x.mean(axis=0)) / np.where(deviations > 0, deviations, 1.0))
+
+
+def _yields(
+    y: Array, outputs: Sequence[str], specifications: Mapping[str, Specification], count: int
+) -> dict[str, Yield]:
+    """Yields of results, of ``count`` samples in all, for each specification and for all."""
+    passed = {}
+    for name, limits in specifications.items():
+        values = y[:, list(outputs).index(name)]
+        passed[name] = (values >= limits.least) & (values <= limits.most)
     if passed:
         passed["all"] = np.logical_and.reduce(list(passed.values()))
-    yields = {name: _yield(int(p.sum()), len(rows)) for name, p in passed.items()}
-    return Tolerances(found, yields, len(rows) - len(good))
+    return {name: _yield(int(p.sum()), count) for name, p in passed.items()}
 
 
 def _output(names: Sequence[str], x: Array, y: Array) -> Output:
     centred = y - y.mean()
-    deviations = x.std(axis=0)
-    scaled = (x - x.mean(axis=0)) / np.where(deviations > 0, deviations, 1.0)
+    scaled = _scaled(x)
     effects = np.linalg.lstsq(scaled, centred, rcond=None)[0]
     rest = float(np.mean((centred - scaled @ effects) ** 2))
     total = float(np.sum(effects**2)) + rest
@@ -219,10 +289,10 @@ def load_study(path: str | Path) -> tuple[ToleranceStudy, Capacitances]:
             f"samples = {samples} must be a power of two above {len(parameters) + 1}, such as 64"
         )
     study = ToleranceStudy(parameters, {}, samples, top.integer("seed", 0, 2**63 - 1, 0))
-    folder = file.resolve().parent
-    scenario = folder / top.string("scenario") if "scenario" in top else None
-    template = Table(top.raw("design", "[design], a design's file"), file.name, "design").data
-    evaluation = Capacitances.of(file.name, template, folder, study.points, scenario)
+    parts = {kind: _part(top, file, kind) for kind in ("design", "scenario", "readout")}
+    if parts["design"] is None:
+        raise top.error("missing key 'design'; add [design], a design's file, or its path")
+    evaluation = Capacitances.of(parts["design"], study.points, parts["scenario"], parts["readout"])
     limits = Table(top.data.get("specifications", {}), file.name, "specifications")
     for name in limits.data:
         if name not in evaluation.outputs:
@@ -231,10 +301,37 @@ def load_study(path: str | Path) -> tuple[ToleranceStudy, Capacitances]:
     return ToleranceStudy(parameters, specifications, samples, study.seed), evaluation
 
 
+_KINDS_OF_FILES: dict[str, tuple[type[CapSenseError], Callable[[str], Any]]] = {
+    "design": (DesignError, load_design_template),
+    "scenario": (ScenarioError, load_scenario_template),
+    "readout": (ReadoutError, load_readout_template),
+}
+"""What is raised for anything that is wrong in a file, and what loads it."""
+
+
+def _part(top: Table, file: Path, kind: str) -> Any:
+    """A design, scenario or readout: a table of the study, a path relative to it, or a name."""
+    if kind not in top:
+        return None
+    error, load = _KINDS_OF_FILES[kind]
+    folder = file.resolve().parent
+    if isinstance(top.data[kind], str):
+        path = top.string(kind)
+        return load(str(folder / path) if path.endswith(".toml") else path)
+    return Template(
+        f"{file.name}: {kind}", Table(top.data[kind], file.name, kind).data, folder, error
+    )
+
+
 def _distribution(table: Table, name: str) -> Distribution:
     one = Table(table.data[name], table.source, f"parameter {name!r}")
-    if not name.isidentifier():
-        raise one.error("is no name for expressions; use letters, digits and _")
+    if "distribution" not in one:
+        raise one.error(
+            'has no distribution; write { distribution = "normal", … }, and put dotted keys in '
+            f'quotes, such as "{name}.KEY"'
+        )
+    if not (name.isidentifier() or "." in name):
+        raise one.error("is no name for expressions, and no key; use letters, digits and _")
     kind: Any = one.choice("distribution", list(KINDS))
     one.only(("distribution", *KINDS[kind]))
     if kind == "normal":
@@ -254,16 +351,17 @@ def _limits(table: Table, name: str) -> Specification:
     one = Table(table.data[name], table.source, f"specification {name!r}")
     one.only(("min", "max"))
     if not one.data:
-        raise one.error("has neither min nor max; give one or both, in F")
-    least = one.number("min", -1.0, 1.0, -np.inf, unit="F")
-    most = one.number("max", -1.0, 1.0, np.inf, unit="F")
+        raise one.error("has neither min nor max; give one or both, in F or codes")
+    bound, unit = (1e12, "codes") if is_code(name) else (1.0, "F")
+    least = one.number("min", -bound, bound, -np.inf, unit=unit)
+    most = one.number("max", -bound, bound, np.inf, unit=unit)
     if not least <= most:
         raise one.error(f"min = {least:g} is above max = {most:g}; exchange them")
     return Specification(least, most)
 
 
 def tornado(found: Tolerances, outputs: Sequence[str]) -> Figure:
-    """Bars of each parameter's effect on outputs [fF], the largest on top.
+    """Bars of each parameter's effect on outputs [fF or codes], the largest on top.
 
     Raises:
         KeyError: There is no such output.
@@ -276,8 +374,11 @@ def tornado(found: Tolerances, outputs: Sequence[str]) -> Figure:
     figure = Figure(figsize=(7, len(outputs) * (1.0 + 0.3 * rows)), layout="constrained")
     for axes, name in zip(figure.subplots(len(outputs), squeeze=False)[:, 0], outputs, strict=True):
         effects = found.outputs[name].effects
-        sizes = [1e15 * abs(e) for e in effects.values()]
+        factor, unit = unit_of_output(name)
+        sizes = [factor * abs(e) for e in effects.values()]
         axes.barh(list(effects), [2 * s for s in sizes], left=[-s for s in sizes], color=COLOURS[0])
         axes.invert_yaxis()
-        dress(axes, x="change for ± one standard deviation [fF]", title=name)
+        room = 1.05 * max(sizes) or 1.0
+        axes.set_xlim(-room, room)
+        dress(axes, x=f"change for ± one standard deviation [{unit}]", title=name)
     return figure

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 import tiny_field
 from approximate import approx
 
@@ -16,7 +17,15 @@ import capsense as cs
 from capsense.__main__ import BAD_INPUT, OK, main
 from capsense.errors import DesignError, ScenarioError
 from capsense.learning import optimise
-from capsense.learning.optimise import Bound, DesignTask, at_bounds, load_task, search, to_toml
+from capsense.learning.optimise import (
+    Bound,
+    Constraints,
+    DesignTask,
+    at_bounds,
+    load_task,
+    search,
+    to_toml,
+)
 from capsense.learning.servo import LimbPose
 from capsense.studies.template import evaluate
 
@@ -131,6 +140,47 @@ def test_search(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(search(few)[0], task.start)
 
 
+@pytest.mark.parametrize("limit", ["area = { all = { max = 5.0e-5 } }", "outline = [0.062, 0.005]"])
+def test_constraints(task_file: Path, monkeypatch: pytest.MonkeyPatch, limit: str) -> None:
+    """The best of a cost that falls with the side lies on the limit: 5 mm; nothing beyond it is
+    built, or counts."""
+    start = TASK.replace("start = 0.005", "start = 0.0035").replace(
+        "evaluations = 3", "evaluations = 30"
+    )
+    task_file.write_text(f"{start}\n[constraints]\n{limit}\n")
+    task = load_task(task_file)
+    built: list[float] = []
+
+    def bound(self: DesignTask, values: np.ndarray, *_: Any) -> Bound:
+        built.append(float(values[0]))
+        return Bound(1.0 - float(values[0]), LimbPose())
+
+    monkeypatch.setattr(DesignTask, "bound", bound)
+    values, _ = search(task)
+    assert max(built) <= 0.005 + 1e-6
+    assert values[0] == approx(0.005, abs=3e-5)
+    assert 10 < len(built) <= 30
+    np.testing.assert_array_equal(search(task)[0], values)
+
+
+def test_constraints_of_shapes(task_file: Path) -> None:
+    """Areas of one electrode and of all; outlines as points, with a clearance and a notch."""
+    design = load_task(task_file).design(np.array([0.005]))
+    area, both = 25e-6, 50e-6
+    box = shapely.box(-0.03, -0.0025, 0.03, 0.0025)
+    notch = box.difference(shapely.box(0.0271, -1.0, 0.0279, 0.0))
+    for areas, outline, why in (
+        ({"A": (area, area), "all": (both, both)}, box, ""),
+        ({"B": (1.01 * area, 1.0)}, None, "area of B is 2.5e-05 m², below its limit of 2.525e-05"),
+        ({"all": (0.0, 0.9 * both)}, None, "area of all is 5e-05 m², above"),
+        ({}, box.buffer(-0.001, join_style="mitre"), "'A' has 13 mm² outside"),
+        ({}, notch, "'B' has 2 mm² outside"),
+    ):
+        found = Constraints(areas, outline).violation(design)
+        assert why in found
+        assert bool(why) == bool(found)
+
+
 def test_start_that_cannot_be_made(monkeypatch: pytest.MonkeyPatch) -> None:
     task = load_task(EXAMPLE)
     monkeypatch.setattr(DesignTask, "bound", quadratic(np.full(4, 0.04) - 0.02, []))
@@ -189,6 +239,21 @@ def test_bounds_of_a_task(task_file: Path) -> None:
         ("[parameters]\nside", "[other]\nside", "other"),
         ('"=side/2', '"=sied/2', "sied"),
         ("0.03-side/2", "-0.03+side/2", "touch|overlap|short"),
+        (
+            "[design]",
+            "[constraints]\narea = { all = { max = 49e-6 } }\n[design]",
+            "start breaks a constraint: area of all is 5e-05",
+        ),
+        ("[design]", "[constraints]\noutline = [0.05, 0.01]\n[design]", "'A' has 25 mm² outside"),
+        ("[design]", "[constraints]\nclearance = 0.01\n[design]", "add outline"),
+        ("[design]", "[constraints]\nclearance = 0.01\noutline = [0.1, 0.02]\n[design]", "nothing"),
+        ("[design]", "[constraints]\narea = { C = { max = 1 } }\n[design]", "no electrode"),
+        ("[design]", "[constraints]\narea = { A = { min = 2, max = 1 } }\n[design]", "max"),
+        (
+            "[design]",
+            "[constraints]\noutline = [[0, 0], [1, 1], [1, 0], [0, 1]]\n[design]",
+            "crosses itself",
+        ),
     ],
 )
 def test_wrong_tasks(task_file: Path, before: str, after: str, why: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from approximate import approx
 
-from capsense.errors import DesignError, ScenarioError
+from capsense.errors import DesignError, ReadoutError, ScenarioError
 from capsense.studies.points import StudyRow
 from capsense.studies.tolerances import (
     Distribution,
@@ -17,6 +17,7 @@ from capsense.studies.tolerances import (
     ToleranceStudy,
     analyse,
     load_study,
+    narrowed,
     tolerance,
     tornado,
 )
@@ -47,6 +48,9 @@ class Line:
 
     def key(self, point: Mapping[str, float]) -> str:
         return repr(point)
+
+    def group(self, point: Mapping[str, float]) -> str:
+        return ""
 
     def __call__(self, point: Mapping[str, float]) -> tuple[float, float]:
         return 3 * point["a"] - point["b"], point["b"]
@@ -82,6 +86,66 @@ def test_a_line(tmp_path: Path) -> None:
     assert found.yields["line"].share == 1.0
     figure = tornado(found, ["line", "b"])
     assert [t.get_text() for t in figure.axes[0].get_yticklabels()] == ["a", "b", "c"]
+
+
+def test_narrowed() -> None:
+    """Of a linear function, the yields of samples with the tighter tolerance itself."""
+    limits = {"line": Specification(2.3, 2.9)}
+    study = ToleranceStudy(SCATTER, limits, 512)
+    rows = [StudyRow(p, Line()(p)) for p in study.points]
+    found = analyse(rows, Line.outputs, limits)
+    held = narrowed(found, limits, {"b": 0.25, "c": 0.0})
+    tight = {**SCATTER, "b": Distribution("uniform", 0.375, 0.625)}
+    rows = [StudyRow(p, Line()(p)) for p in ToleranceStudy(tight, limits, 512).points]
+    expected = analyse(rows, Line.outputs, limits).yields
+    assert abs(held["all"].passed - expected["all"].passed) <= 3
+    assert held["all"].passed > found.yields["all"].passed + 50
+    assert narrowed(found, limits, {}) == found.yields
+    x = np.array([list(p.values()) for p in study.points])
+    deviations = [d.deviation for d in SCATTER.values()]
+    assert x.std(axis=0) == approx(deviations, rel=1e-2)
+
+
+def test_files_beside_a_study(tmp_path: Path) -> None:
+    """A design by its name, a scenario and a readout by their paths or as tables, dotted keys of
+    them, and limits of counts."""
+    body = """[[{}body]]
+name = "b"
+shape = "sphere"
+radius = 0.01
+material = "steel"
+pose = {{ position = [0, 0, "=height"] }}
+"""
+    head = "name = 'n'\nsamples = 8\ndesign = 'patch'\n"
+    scatter = """[parameters]
+height = { distribution = "uniform", from = 0.02, to = 0.03 }
+"calibration.gain" = { distribution = "normal", mean = 1.0, sigma = 0.01 }
+[specifications]
+dcode_E1 = { min = 100 }
+"""
+    (tmp_path / "b.toml").write_text("name = 'b'\ndesign = 'patch'\n" + body.format(""))
+    (tmp_path / "c.toml").write_text('chip = "fdc1004"\n')
+    file = tmp_path / "study.toml"
+    keys = []
+    for content in (
+        head + "scenario = 'b.toml'\nreadout = 'c.toml'\n" + scatter,
+        head + "readout = 'fdc1004'\n" + scatter + body.format("scenario."),
+    ):
+        file.write_text(content)
+        study, evaluation = load_study(file)
+        assert study.specifications == {"dcode_E1": Specification(100.0, np.inf)}
+        assert evaluation.outputs[-1] == "dcode_E4"
+        keys.append(evaluation.key(study.points[0]))
+    assert keys[0] == keys[1]
+    for before, after, why in (
+        ('"calibration.gain"', "calibration.gain", "put dotted keys in quotes"),
+        ("dcode_E1", "dcode_E9", "no output"), ("'patch'", "'patsh'", "patch"),
+        ("'fdc1004'", "'fdc1005'", "fdc1004"), ("design = 'patch'\n", "", "missing key 'design'"),
+    ):  # fmt: skip
+        assert before in content
+        file.write_text(content.replace(before, after))
+        with pytest.raises((ScenarioError, DesignError, ReadoutError), match=why):
+            load_study(file)
 
 
 def test_wilson() -> None:
