@@ -232,7 +232,8 @@ def test_names_of_gerber_files(name: str, kind: str | None, place: int) -> None:
 
 @pytest.mark.parametrize(("function", "part"), [
     ("Copper,L1,Top", GerberPart("copper", TOP)), ("Copper,L3,Inr", GerberPart("copper", 2)),
-    ("Copper,L4,Bot,Signal", GerberPart("copper", BOTTOM)), ("Soldermask,Bot", GerberPart("mask", BOTTOM)),
+    ("Copper,L4,Bot,Signal", GerberPart("copper", BOTTOM)),
+    ("Soldermask,Bot", GerberPart("mask", BOTTOM)),
     ("Profile,NP", GerberPart("outline")), ("Plated,1,2,Blind", GerberPart("drill", span=(1, 2))),
     ("MixedPlating,1,4", GerberPart("drill", span=(1, 4))), ("NonPlated,1,2,NPTH", None),
     ("Legend,Top", None),
