@@ -29,7 +29,7 @@ TOP, BOTTOM = 0, 10_000
 """Places of the outer layers in the order of copper; inner ones have their number."""
 
 
-class Part(NamedTuple):
+class GerberPart(NamedTuple):
     """What a file of a set is."""
 
     kind: str
@@ -87,7 +87,7 @@ class _SetReader:
             str(row.get("Path", "")).rpartition("/")[2]: str(row.get("FileFunction", ""))
             for row in self.job.get("FilesAttributes", ())
         }
-        self.parts: dict[Path, Part] = {}
+        self.parts: dict[Path, GerberPart] = {}
         unknown = []
         for file in sorted(f for f in where.rglob("*") if f.is_file()):
             head = file.read_bytes()[:HEAD].decode("latin-1")
@@ -103,7 +103,7 @@ class _SetReader:
                 "are known by names such as F_Cu, In1_Cu, B_Cu, F_Mask, Edge_Cuts."
             )
 
-    def of_kind(self, kind: str) -> list[tuple[Path, Part]]:
+    def of_kind(self, kind: str) -> list[tuple[Path, GerberPart]]:
         """Files of a kind, in the order of their places."""
         found = [(file, part) for file, part in self.parts.items() if part.kind == kind]
         return sorted(found, key=lambda row: (row[1].place, row[0].name))
@@ -304,7 +304,7 @@ _SIDES = (
 _DRILL = re.compile(r"^M48\b|^T\d+C[\d.]+|^;(T\d+)? *Holesize ", re.MULTILINE)
 
 
-def part_of(name: str, head: str, function: str = "") -> Part | None:
+def part_of(name: str, head: str, function: str = "") -> GerberPart | None:
     """What a file is, by its attributes or its name; None of what is not read.
 
     Args:
@@ -322,43 +322,45 @@ def part_of(name: str, head: str, function: str = "") -> Part | None:
         return _stated(words)
     name = name.lower()
     if drill:
-        return None if re.search(r"n(on)?[-_. ]?p(th|lated)|unplated", name) else Part("drill")
+        return (
+            None if re.search(r"n(on)?[-_. ]?p(th|lated)|unplated", name) else GerberPart("drill")
+        )
     for kind, rows in _SUFFIXES.items():
         for place, suffixes in rows.items():
             if name.endswith(tuple(suffixes.split())):
-                return Part(kind, place)
+                return GerberPart(kind, place)
     if inner := _INNER.search(name):
-        return Part("copper", int(inner[1] or inner[2]))
+        return GerberPart("copper", int(inner[1] or inner[2]))
     return None if _OTHER.search(name) else _named(name)
 
 
-def _stated(words: list[str]) -> Part | None:
+def _stated(words: list[str]) -> GerberPart | None:
     """A part by the words of its X2 function."""
     kind, *rest = words
     side = BOTTOM if "bot" in rest else TOP
     if kind == "copper":
         inner = "inr" in rest and (number := re.fullmatch(r"l(\d+)", rest[0]))
-        return Part("copper", int(number[1]) - 1 if inner and number else side)
+        return GerberPart("copper", int(number[1]) - 1 if inner and number else side)
     if kind == "soldermask":
-        return Part("mask", side)
+        return GerberPart("mask", side)
     if kind == "profile":
-        return Part("outline")
+        return GerberPart("outline")
     if kind in ("plated", "mixedplating"):
         span = [int(w) for w in rest[:2] if w.isdigit()]
-        return Part("drill", span=(span[0], span[1]) if len(span) == 2 else None)
+        return GerberPart("drill", span=(span[0], span[1]) if len(span) == 2 else None)
     return None
 
 
-def _named(name: str) -> Part | None:
+def _named(name: str) -> GerberPart | None:
     """A part by the words of its name, without suffix."""
     stem = name.rpartition(".")[0]
     side = next((place for place, marks in _SIDES if re.search(marks, stem)), None)
     if re.search(r"outline|profile|edge|dimension|contour", stem):
-        return Part("outline", 0)
+        return GerberPart("outline", 0)
     if re.search(r"mask|resist|stop|^sm[tb]$", stem):
-        return None if side is None else Part("mask", side)
+        return None if side is None else GerberPart("mask", side)
     words = "l|lyr|layer|in|inner|mid|int|inner[-_. ]?l"
     number = re.search(rf"(?:^|[^a-z])(?:{words})[-_. ]?0*(\d+)", stem)
     if side is not None and not (number and re.search(r"inn?(er)?[-_. ]?l?\d", stem)):
-        return Part("copper", side)
-    return Part("copper", int(number[1])) if number else None
+        return GerberPart("copper", side)
+    return GerberPart("copper", int(number[1])) if number else None

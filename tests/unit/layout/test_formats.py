@@ -10,7 +10,7 @@ import trimesh
 from approximate import approx
 
 import capsense as cs
-from capsense.layout.gerber import BOTTOM, TOP, Part, layer_names, part_of
+from capsense.layout.gerber import BOTTOM, TOP, GerberPart, layer_names, part_of
 
 
 def found(layout: cs.BoardLayout) -> dict[str, tuple[float, int]]:
@@ -231,13 +231,14 @@ def test_names_of_gerber_files(name: str, kind: str | None, place: int) -> None:
 
 
 @pytest.mark.parametrize(("function", "part"), [
-    ("Copper,L1,Top", Part("copper", TOP)), ("Copper,L3,Inr", Part("copper", 2)),
-    ("Copper,L4,Bot,Signal", Part("copper", BOTTOM)), ("Soldermask,Bot", Part("mask", BOTTOM)),
-    ("Profile,NP", Part("outline")), ("Plated,1,2,Blind", Part("drill", span=(1, 2))),
-    ("MixedPlating,1,4", Part("drill", span=(1, 4))), ("NonPlated,1,2,NPTH", None),
+    ("Copper,L1,Top", GerberPart("copper", TOP)), ("Copper,L3,Inr", GerberPart("copper", 2)),
+    ("Copper,L4,Bot,Signal", GerberPart("copper", BOTTOM)),
+    ("Soldermask,Bot", GerberPart("mask", BOTTOM)),
+    ("Profile,NP", GerberPart("outline")), ("Plated,1,2,Blind", GerberPart("drill", span=(1, 2))),
+    ("MixedPlating,1,4", GerberPart("drill", span=(1, 4))), ("NonPlated,1,2,NPTH", None),
     ("Legend,Top", None),
 ])  # fmt: skip
-def test_functions_of_gerber_files(function: str, part: Part | None) -> None:
+def test_functions_of_gerber_files(function: str, part: GerberPart | None) -> None:
     """What a file says of itself counts more than its name."""
     assert part_of("x-F_Cu.gbr", f"%FSLAX46Y46*%\n%TF.FileFunction,{function}*%") == part
     assert part_of("x-F_Cu.gbr", "%FSLAX46Y46*%", function) == part
