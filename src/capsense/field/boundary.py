@@ -46,6 +46,8 @@ _FEW_FACETS = 64
 """Sheets of more facets than this are curved; their facets are not searched for narrow gaps."""
 _FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
+SEVERAL, _EACH = 24, 70
+"""Designs of more terminals than this are cut coarser from so many panels each on."""
 _FINEST, _COARSEST = 0.5, 8.0
 """The finest, and where the search begins, as multiples of the default sizes."""
 POWER = 1.7
@@ -151,16 +153,20 @@ def _fitted(design: Design) -> float:
 
     Sizes are halved from the coarsest on, so that no cut has many more panels than are allowed.
     """
+    count_of_terminals = len(terminals(design))
+    most = _MANY
+    if count_of_terminals > SEVERAL:
+        most = min(_MANY, max(_FEW, _EACH * count_of_terminals))
 
     def count_at(scale: float) -> int:
         return sum(len(part.pieces) for part in _pieces(design, scale))
 
     scale, count = _COARSEST, count_at(_COARSEST)
-    while scale > 1.0 and count * 2**POWER < 1.5 * _MANY:
+    while scale > 1.0 and count * 2**POWER < 1.5 * most:
         scale /= 2
         count = count_at(scale)
-    if scale > 1.0 or count > _MANY:
-        return scale * (count / _MANY) ** (1 / POWER)
+    if scale > 1.0 or count > most:
+        return scale * (count / most) ** (1 / POWER)
     return float(np.clip((count / _FEW) ** (1 / POWER), _FINEST, 1.0))
 
 
