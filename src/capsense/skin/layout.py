@@ -30,9 +30,8 @@ BACKING = 0.10
 FLATTEST = 0.15
 """Electrodes on larger radii [m] are flat."""
 _RESOLUTION = 0.5
-"""``[build] resolution`` of the designs of patches: against 1, readings change by up to 1 % from 3 mm
-on, and by up to 4 % at 1 mm, and a field is built in about a third of the time
-(``benchmarks/skin_make.py --resolution``)."""
+"""``[build] resolution`` of the designs of patches: against 1, readings change by up to 1 % from
+3 mm on, and by up to 4 % at 1 mm (``benchmarks/skin_make.py --resolution``)."""
 _SIGHT = 0.40
 """Side of the box in which a patch looks for bodies [m]."""
 _READ = 5e-4
