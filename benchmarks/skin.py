@@ -122,6 +122,53 @@ def far_away(world: World) -> None:
     print(f"  16 sensors, 30 bodies, all far away: {1e3 * np.median(times):.2f} ms")
 
 
+def whole_body(steps: int) -> None:
+    """Print what a reading of 64 patches costs on one and on two threads, taken in turn.
+
+    Four links with sixteen ``arm_segment`` each, 384 electrodes; a person of 12 capsules passes.
+    """
+    turn = 2 * math.pi / 4
+    poses = {
+        f"link{k}_{row}_{n}": cs.Pose((0.6 * k, 0.0, 0.1 * row))
+        @ cs.Pose((0.0, 0.0, 0.0), (0.0, 0.0, math.sin(n * turn / 2), math.cos(n * turn / 2)))
+        @ cs.Pose((0.048, 0.0, 0.0), (0.5, 0.5, 0.5, 0.5))
+        for k in range(4)
+        for row in range(4)
+        for n in range(4)
+    }
+    one = cs.Simulator("arm_segment")
+    skins = [
+        cs.Skin({name: (one.copy(), pose) for name, pose in poses.items()}, threads=n)
+        for n in (1, 2)
+    ]
+    wall: list[list[float]] = [[], []]
+    busy: list[list[float]] = [[], []]
+    for k in range(-3, steps):
+        at = 0.9 + 0.9 * math.sin(0.1 * k)
+        person = [
+            cs.Body(
+                cs.Capsule(0.05, 0.25),
+                cs.Pose((at + 0.12 * (n % 4) - 0.2, 0.16 + 0.02 * (n // 4), 0.2 * (n // 4))),
+                material="human",
+            )
+            for n in range(12)
+        ]
+        for which, skin in enumerate(skins):
+            scene = cs.Scene(person)
+            start, used = time.perf_counter(), time.process_time()
+            skin.step(scene)
+            if k >= 0:
+                wall[which].append(1e3 * (time.perf_counter() - start))
+                busy[which].append(1e3 * (time.process_time() - used))
+    first, second = (float(np.median(times)) for times in wall)
+    processor = [float(np.median(times)) for times in busy]
+    print(
+        f"  64 sensors, 384 electrodes: median {first:.1f} ms on one thread, "
+        f"{second:.1f} ms on two (ratio {first / second:.2f}); processor time "
+        f"{processor[0]:.1f} and {processor[1]:.1f} ms"
+    )
+
+
 def memory() -> None:
     """Print the memory of one more sensor."""
     first = cs.Simulator("arm_segment")
@@ -156,9 +203,13 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--only", choices=["whole-body"], help="one part alone")
     options = parser.parse_args()
     machine = describe_machine(("numpy", "numba", "mujoco"))
     print(f"{machine['processor']}, {machine['cores']} cores, load {machine['load']:.1f}")
+    if options.only:
+        whole_body(options.steps)
+        return
     accuracy()
     print("a step of 16 sensors, 96 electrodes:")
     world = World()
@@ -166,6 +217,7 @@ def main() -> None:
         time_steps(world, threads, options.steps)
     parts(world, options.steps // 5)
     far_away(world)
+    whole_body(options.steps)
     memory()
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.reading import CapacitanceChange, KeptField, Reading, StepStats, Touch
 from capsense.scene import Scene
-from capsense.scene.contact import warn_of_contact, warn_of_doubt
+from capsense.scene.contact import doubt_of, warn_of_contact
 from capsense.scene.depth import DepthFrame
 
 if TYPE_CHECKING:
@@ -44,6 +45,15 @@ _OTHER_NAMES: dict[str, PresetName] = {"learning": "fast"}
 
 _DOUBTFUL, _SEEN = 0.1, 1e-4
 """Estimated errors are warned of above this part of a change, and of the largest capacitance."""
+
+
+class Doubt(NamedTuple):
+    """That the estimated error of a reading is large."""
+
+    share: float
+    """Estimated error over the largest change of an electrode."""
+    text: str
+    """What a warning says of it."""
 
 
 class _Solver(Protocol):
@@ -154,6 +164,10 @@ class Simulator:
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
         self._doubtful = _SEEN * float(self.baseline.max())
         """Smaller estimated errors are not warned of [F]; infinite once one was."""
+        self.doubt: Doubt | None = None
+        """The large estimated error that the first reading with one had, if there was one."""
+        self.in_skin = False
+        """Whether a skin that reads this sensor warns of its ``doubt`` in its place."""
         self.readout: Readout | None = None
         """The chip that turns capacitances into counts, if any."""
         self.use_readout(readout)
@@ -356,7 +370,10 @@ class Simulator:
         self._doubtful = math.inf
         electrode = self.design.electrodes[most]
         share = error / max(own[most], 1e-300)
-        warn_of_doubt(scene, (electrode.name, electrode.surface.triangles), share, reason())
+        surface = electrode.name, electrode.surface.triangles
+        self.doubt = Doubt(share, doubt_of(scene, surface, share, reason()))
+        if not self.in_skin:
+            warnings.warn(self.doubt.text, stacklevel=4)
 
     def _reading(
         self,

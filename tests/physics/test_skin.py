@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -231,3 +232,34 @@ def test_a_field_of_another_design_is_refused(tiny: cs.Simulator) -> None:
     """A simulator does not take the field of other terminals."""
     with pytest.raises(FieldError, match="leave it out"):
         cs.Simulator("six_patch", background=tiny.background)
+
+
+def test_one_warning_tells_of_all_large_estimated_errors() -> None:
+    """Sensors that look away change little, so that their estimated errors are large."""
+    turn = np.pi / 4
+    poses = {
+        f"s{n}": cs.Pose((0.0, 0.0, 0.0), (0.0, 0.0, np.sin(n * turn), np.cos(n * turn)))
+        @ cs.Pose((0.048, 0.0, 0.0), (0.5, 0.5, 0.5, 0.5))
+        for n in range(4)
+    }
+    one = cs.Simulator("arm_segment")
+    skin = cs.Skin({name: (one.copy(), pose) for name, pose in poses.items()}, threads=1)
+    person = [
+        cs.Body(
+            cs.Capsule(0.05, 0.25),
+            cs.Pose((0.12 * (n % 4) - 0.2, 0.16 + 0.02 * (n // 4), 0.2 * (n // 4) - 0.2)),
+            material="human",
+        )
+        for n in range(12)
+    ]
+    with pytest.warns(UserWarning, match="sensors have large estimated errors") as told:
+        skin.step(cs.Scene(person))
+    assert len(told) == 1
+    doubts = {name: s.doubt for name, s in skin.simulators.items() if s.doubt is not None}
+    assert len(doubts) >= 2
+    worst = max(doubts, key=lambda name: doubts[name].share)
+    text = str(told[0].message)
+    assert text.startswith(f"{len(doubts)} of 4 sensors") and f"the worst is {worst!r}" in text
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        skin.step(cs.Scene(person))

@@ -34,6 +34,7 @@ _STEP = 2e-3
 """and how much nearer they come, going back by this [m]."""
 _ROUGH = 0.5
 """A reading with an expected error of this part of its largest change is told."""
+_ROUGH_TEXT = "the reading is rough"
 _NOTHING = "nothing is in view, so that every change is exactly 0"
 
 
@@ -92,7 +93,7 @@ def felt(simulator: Simulator, scene: Scene, found: list[str]) -> list[str]:
     if found or error < _ROUGH * change:
         return found
     return [
-        f"the reading is rough: it changes by {1e15 * change:.2g} fF, and the solver itself "
+        f"{_ROUGH_TEXT}: it changes by {1e15 * change:.2g} fF, and the solver itself "
         f"expects an error of {1e15 * error:.2g} fF, as where bodies lie within one another; leave "
         "one of them out with exclude, or give those that overlap as one mesh"
     ]
@@ -101,6 +102,11 @@ def felt(simulator: Simulator, scene: Scene, found: list[str]) -> list[str]:
 def blind(found: list[str]) -> bool:
     """Whether findings say that nothing is in view."""
     return any(text.startswith(_NOTHING) for text in found)
+
+
+def is_rough(text: str) -> bool:
+    """Whether a finding says that the estimated error of a reading is large."""
+    return text.startswith(_ROUGH_TEXT)
 
 
 def nothing_seen(design: Design) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from capsense._thread_pool import ForkSafeRLock, ThreadPool
 from capsense._validate import suggest
 from capsense.adapters import GeometrySensor, WorldSource
-from capsense.adapters.placement import blind
+from capsense.adapters.placement import blind, is_rough
 from capsense.adapters.world import Frames, World
 from capsense.design.model import Domain
 from capsense.errors import SceneError, listed
@@ -102,10 +102,12 @@ class AttachedSkin:
             return
         unseen = sum(blind(texts) for texts in found.values())
         told: dict[str, list[str]] = {}  # finding → sensors
+        rough = [text for texts in found.values() for text in texts if is_rough(text)]
         for name, texts in found.items():
             for text in texts:
                 if not blind([text]) or unseen == len(self):
-                    told.setdefault(text, []).append(name)
+                    one = rough[0] if is_rough(text) else text  # figures differ
+                    told.setdefault(one, []).append(name)
         lines = [f"sensor {listed(names, 1)}: {text}" for text, names in told.items()]
         if lines:
             more = f";\nand {len(lines) - 4} more, see check()" if len(lines) > 4 else ""

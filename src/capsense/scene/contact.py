@@ -187,8 +187,8 @@ def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array], touch: float)
         )
 
 
-def warn_of_doubt(scene: Scene, electrode: tuple[str, Array], share: float, reason: str) -> None:
-    """Warn that the estimated error of a reading is large.
+def doubt_of(scene: Scene, electrode: tuple[str, Array], share: float, reason: str) -> str:
+    """What a warning says of a reading of which the estimated error is large.
 
     Args:
         scene: The bodies.
@@ -205,11 +205,10 @@ def warn_of_doubt(scene: Scene, electrode: tuple[str, Array], share: float, reas
     }
     what = min(near, key=lambda body: near[body]) if near else "the camera sees"
     far = f", {1e3 * max(near[what], 0.0):.2g} mm away," if near else ""
-    warnings.warn(
+    return (
         f"the estimated error of electrode {name} is {share:.0%} of what {what}{far} changes"
         f'{reason and ": " + reason}; move it away, or take preset "fine". '
-        "Further warnings are suppressed; reading.stats.solver_error has the estimate",
-        stacklevel=4,
+        "Further warnings are suppressed; reading.stats.solver_error has the estimate"
     )
 
 

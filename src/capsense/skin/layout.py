@@ -16,7 +16,8 @@ from capsense._validate import as_number
 from capsense.design import parse_design
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
-from capsense.field.boundary import build_cost, build_model
+from capsense.field.boundary import Accuracy, build_cost, build_model
+from capsense.field.cache import default_settings
 from capsense.scene import Pose, Scene
 from capsense.scene.contact import find_contacts, points_on
 
@@ -28,6 +29,9 @@ BACKING = 0.10
 """The housing behind an electrode is longer than that by this [m]."""
 FLATTEST = 0.15
 """Electrodes on larger radii [m] are flat."""
+_RESOLUTION = 0.5
+"""``[build] resolution`` of the designs of patches: against 1, readings change by up to 1 % from
+3 mm on, and by up to 4 % at 1 mm (``benchmarks/skin_make.py --resolution``)."""
 _SIGHT = 0.40
 """Side of the box in which a patch looks for bodies [m]."""
 _READ = 5e-4
@@ -139,7 +143,9 @@ class SkinLayout(Mapping[str, tuple[Design, Pose]]):
     def _build_seconds(self) -> float:
         """Estimated time of building the fields [s]; their panels are cut once for that."""
         designs = {id(d): d for d, _ in self.patches.values()}.values()
-        return sum(build_cost(build_model(d.in_units).panels.size)[0] for d in designs)
+        scales = [Accuracy(default_settings(d).panel_scale) for d in designs]
+        models = (build_model(d.in_units, a) for d, a in zip(designs, scales, strict=True))
+        return sum(build_cost(model.panels.size)[0] for model in models)
 
     def __repr__(self) -> str:
         designs = {id(d): d for d, _ in self.patches.values()}
@@ -202,6 +208,7 @@ def pad_design(outline: Mapping[str, Any], size: float, radius: float, pad: Pad)
         "domain": {"size": [side, side, side + backplane], "backplane": backplane, "open": True},
         "electrode": [{"name": "E1", **outline}],
         "conductor": [conductor],
+        "build": {"resolution": _RESOLUTION},
     }
     if round_link:
         data["bend"] = {"radius": radius}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -41,7 +41,8 @@ Region = tuple[Sequence[float], Sequence[float]] | Callable[[Array, Array], NDAr
 
 _PAD, _TAXEL = Pad(), Pad(0.004)
 _CLASS = 1e-4
-"""Patches of one design differ in how far they bulge by no more than about this [m]."""
+"""Patches of one design differ in how far they bulge, and painted ones in their outlines, by no
+more than about this [m]."""
 _CANDIDATES = (40, 4_000, 20_000)
 """Places that are looked at: so many a patch, at least, and at most."""
 _GRID = 1e-5
@@ -173,8 +174,8 @@ def paint(
 ) -> SkinLayout:
     """Make an electrode of each connected region of a label that is painted on a link.
 
-    The outline of a region is unrolled from the cylinder that fits it best. Each region has a
-    design of its own.
+    The outline of a region is unrolled from the cylinder that fits it best. Regions of which
+    outline and bulge agree within 0.1 mm, also turned half round, share a design.
 
     Args:
         link: Path of a mesh file, or something that has ``vertices`` and ``faces``, in the frame of
@@ -198,19 +199,65 @@ def paint(
     axes = principal_axes(mesh)
     patches: dict[str, tuple[Design, Pose]] = {}
     deviation = {}
+    kinds: list[tuple[_Painted, Design]] = []
     for label in np.unique(labels[labels > 0]).tolist():
         painted = np.flatnonzero(labels == label)
         part = connected_parts(joined[painted], int(joined.max()) + 1)
         for k in range(int(part.max()) + 1):
             name = f"region_{label}" + (f"_{k}" if part.max() else "")
             one = LinkMesh(mesh.vertices, mesh.faces[painted[part == k]])
-            design, pose, off = _region(name, one, axes, pad)
-            patches[name], deviation[name] = (design, pose), off
+            found = _region(name, one, axes, 2 * pad.depth)
+            for first, design in kinds:
+                turned = found.turned_like(first)
+                if turned is not None:
+                    patches[name] = design, turned
+                    break
+            else:
+                patches[name] = found.design(pad), found.pose
+                kinds.append((found, patches[name][0]))
+            deviation[name] = found.off
     return SkinLayout(patches, deviation).warn()
 
 
-def _region(name: str, mesh: LinkMesh, axes: Array, pad: Pad) -> tuple[Design, Pose, float]:
-    """The design of a painted region, where it is, and how far it leaves the surface [m]."""
+class _Painted(NamedTuple):
+    """A painted region, unrolled from its cylinder."""
+
+    outline: shapely.Polygon
+    """In the film [m]; its centroid is the origin."""
+    radius: float
+    """Of the cylinder [m], infinite where the region is flat."""
+    pose: Pose
+    """Of the film in the frame of the link."""
+    off: float
+    """How far the film leaves the surface [m]."""
+
+    def design(self, pad: Pad) -> Design:
+        """The electrode of the region."""
+        shape: dict[str, Any] = {"shape": "polygon", "points": _ring(self.outline.exterior)}
+        if self.outline.interiors:
+            shape["holes"] = [_ring(r) for r in self.outline.interiors]
+        return pad_design(shape, self._size, self.radius, pad)
+
+    def turned_like(self, other: _Painted) -> Pose | None:
+        """Where the design of another region stands for this one; None where they differ."""
+        bulge = abs(1 / self.radius - 1 / other.radius) * self._size**2 / 8
+        if bulge > _CLASS or math.isinf(self.radius) != math.isinf(other.radius):
+            return None
+        for turn in (Pose(), Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))):
+            sign = 1.0 if turn.quaternion[3] else -1.0
+            mine = shapely.transform(self.outline, lambda xy, sign=sign: sign * xy)
+            if shapely.hausdorff_distance(mine.boundary, other.outline.boundary) < _CLASS:
+                return self.pose @ turn
+        return None
+
+    @property
+    def _size(self) -> float:
+        x0, y0, x1, y1 = self.outline.bounds
+        return float(max(x1 - x0, y1 - y0))
+
+
+def _region(name: str, mesh: LinkMesh, axes: Array, least: float) -> _Painted:
+    """Unroll a painted region from a cylinder of a radius of ``least`` [m] or more."""
     corners = mesh.vertices[mesh.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(cross, axis=1)
@@ -234,8 +281,7 @@ def _region(name: str, mesh: LinkMesh, axes: Array, pad: Pad) -> tuple[Design, P
 
         guess = frames.curvature[0, 0]
         found = minimize_scalar(roughness, bounds=(0.5 * guess, 2 * guess), method="bounded")
-        radius = float(f"{1 / found.x:.3g}")
-        radius = max(radius, 2 * pad.depth)
+        radius = max(float(f"{1 / found.x:.3g}"), least)
     height = float(np.mean(_unrolled(inner, radius)[:, 2]))
     local[..., 2] -= height
     flat = _unrolled(local, radius)
@@ -247,13 +293,17 @@ def _region(name: str, mesh: LinkMesh, axes: Array, pad: Pad) -> tuple[Design, P
         )
     rounded = shapely.set_precision(outline.simplify(2 * _GRID), _GRID)
     outline = max(shapely.get_parts(rounded), key=shapely.area)  # rounding cuts slivers off
-    shape: dict[str, Any] = {"shape": "polygon", "points": _ring(outline.exterior)}
-    if outline.interiors:
-        shape["holes"] = [_ring(r) for r in outline.interiors]
-    size = float(np.ptp(flat[..., :2].reshape(-1, 2), axis=0).max())
-    design = pad_design(shape, size, radius, pad)
-    pose = Pose.from_matrix(_matrix(rotation, middle.points[0] + height * rotation[:, 2]))
-    return design, pose, float(np.abs(flat[..., 2]).max())
+    x, y = shapely.get_coordinates(outline.centroid)[0].tolist()
+    turn = np.eye(3)
+    origin = np.array([x, y, 0.0])
+    if math.isfinite(radius):
+        c, q = math.cos(x / radius), math.sin(x / radius)
+        turn = np.array([[c, 0.0, q], [0.0, 1.0, 0.0], [-q, 0.0, c]])
+        origin = Film(radius, {}).placed(origin)
+    outline = shapely.transform(outline, lambda xy: xy - [x, y])
+    at = middle.points[0] + height * rotation[:, 2] + rotation @ origin
+    pose = Pose.from_matrix(_matrix(rotation @ turn, at))
+    return _Painted(outline, radius, pose, float(np.abs(flat[..., 2]).max()))
 
 
 def _ring(ring: Any) -> list[list[float]]:

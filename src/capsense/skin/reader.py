@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -17,7 +18,7 @@ from capsense.errors import CapSenseError, SceneError, SkinError
 from capsense.reading import Reading
 from capsense.readout import SEED_STRIDE, Readout
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Simulator, check_view, read_together
+from capsense.simulator import Doubt, Simulator, check_view, read_together
 
 Array = NDArray[np.float64]
 AnyDesign = Design | str | Path | Simulator
@@ -251,6 +252,8 @@ def read_all(
 ) -> dict[str, Reading]:
     """Read sensors together. Those of one kind are solved in one call for some of them at a time.
 
+    One warning tells of all sensors of which the estimated error is large for the first time.
+
     Args:
         pool: The threads.
         simulators: Name → simulator, each once.
@@ -289,9 +292,29 @@ def read_all(
         return [out[name] for name in names]
 
     most = max(simulator.together for simulator in simulators.values()) if simulators else 1
-    found, failed = pool.run_together(kinds.values(), most, read)
+    sure = {name: s for name, s in simulators.items() if s.doubt is None}
+    for simulator in sure.values():
+        simulator.in_skin = True
+    try:
+        found, failed = pool.run_together(kinds.values(), most, read)
+    finally:
+        for simulator in sure.values():
+            simulator.in_skin = False
+    _warn_of_doubts({n: s.doubt for n, s in sure.items() if s.doubt is not None}, len(simulators))
     readings = {name: found[name] for name in simulators if name in found}
     if failed:
         failures = {name: failed[name] for name in simulators if name in failed}
         raise SkinError(some_failed("sensors", failures, len(simulators)), readings, failures)
     return readings
+
+
+def _warn_of_doubts(doubts: Mapping[str, Doubt], count: int) -> None:
+    """Warn once of the sensors, of so many, that have just got large estimated errors."""
+    if not doubts:
+        return
+    worst = max(doubts, key=lambda name: doubts[name].share)
+    warnings.warn(
+        f"{len(doubts)} of {count} sensors have large estimated errors; the worst is {worst!r}: "
+        f"{doubts[worst].text}",
+        stacklevel=4,
+    )

@@ -210,6 +210,34 @@ def test_painted_faces_become_electrodes() -> None:
         np.testing.assert_allclose(placed.max(axis=0), bounds.max(axis=0), atol=3e-5)
 
 
+def test_congruent_painted_regions_share_a_design() -> None:
+    """Alike on all sides of a round link, also turned half round; others have their own."""
+    link = cylinder()
+    mesh = link.subdivide_to_size(0.008)
+    middle = mesh.triangles_center
+    angle, z = np.arctan2(middle[:, 1], middle[:, 0]), middle[:, 2]
+    mask = np.zeros(len(mesh.faces), int)
+    alike = {1: (0.0, 1.0), 2: (0.5 * np.pi, 1.0), 3: (-0.5 * np.pi, -1.0)}
+    for label, (turn, side) in alike.items():
+        off = side * (np.mod(angle - turn + np.pi, 2 * np.pi) - np.pi)
+        up = side * z
+        wedge = (np.abs(off) < 0.3) & (np.abs(up) < 0.03) & ((off < 0.0) | (up > 0.0))
+        mask[wedge] = label
+    mask[(np.abs(np.abs(angle) - np.pi) < 0.2) & (np.abs(z) < 0.02)] = 4
+    layout = cs.skin.paint(mesh, mask)
+    designs = [layout[f"region_{k}"][0] for k in (1, 2, 3, 4)]
+    assert designs[0] is designs[1] is designs[2]
+    assert designs[3] is not designs[0]
+    surface = cs.TriMesh(link.vertices, link.faces)
+    for label in (1, 2, 3, 4):
+        design, pose = layout[f"region_{label}"]
+        corners = pose.apply(design.electrodes[0].surface.triangles.reshape(-1, 3))
+        painted = mesh.triangles[mask == label].reshape(-1, 3)
+        np.testing.assert_allclose(corners.min(axis=0), painted.min(axis=0), atol=4e-4)
+        np.testing.assert_allclose(corners.max(axis=0), painted.max(axis=0), atol=4e-4)
+        assert np.abs(surface.signed_distance(corners)).max() < 4e-4
+
+
 def test_painted_regions_of_a_round_link_unroll() -> None:
     """Two separate regions of one label; each is bent onto the link's radius."""
     heights = np.linspace(-0.125, 0.125, 51)
