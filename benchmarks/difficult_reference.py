@@ -245,7 +245,8 @@ def pieces(layout: Layout, bodies: list[Row], scale: float) -> tuple[list[Piece]
             under(np.array(body["position"]) + np.array([[-1, -1, 0], [1, 1, 0]]) * half, gap)
         elif shape in ("capsule", "cylinder", "ellipsoid", "sphere"):
             if shape == "sphere":
-                body = {**body, "shape": "ellipsoid", "size": [size[0]] * 3}
+                shape, size = "ellipsoid", [size[0]] * 3
+                body = {**body, "shape": shape, "size": size}
             thin = size[0] < 2e-3
             sides = SIDES if thin else 4 * round(6 / scale)
             lowest = body["position"][2] - abs(turn[2, 2]) * (size[1] / 2 if shape != "ellipsoid"

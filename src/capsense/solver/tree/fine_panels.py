@@ -63,7 +63,7 @@ least so many times as thick as these are wide: edges and two near faces take fi
 _FINER, _THIN, _THINNER, _BROAD = 2000, 1.2, 0.6, 0.02
 """… which are so many, and do not do for shapes less than 1.2 times as thick as these are wide, or
 0.6 times where they are wider than the last [m]: other panels would then be much too wide."""
-_FOIL = 5e-5
+_FOIL = 5e-4
 """Primitives thinner than this part of their width have no energies: their faces would be one."""
 FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 """Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
