@@ -169,11 +169,9 @@ def scenes(texts: dict[str, str]) -> list[Row]:
         body = cup(design, number, gap, radius, "diel", 3.0)
         add("cup of plastic, no finger", design, body)
         add("cup of plastic, finger low", design, body, inside(body, 0.001))
-        for full in (0.3, 0.8):
+        for full in (0.3, 0.8) if design == BARE else (0.8,):
             glass = cup(design, number, gap, radius, "diel", 6.0)
             add(f"water {100 * full:g} % full", design, glass, water(glass, full))
-        glass = cup(design, number, 0.015, radius, "diel", 6.0)
-        add("water at 15 mm", design, glass, water(glass, 0.8))
     for design in ("room", "array in a room"):
         number = 4 if design == "room" else 0
         x, y, _ = pad(design, number)
