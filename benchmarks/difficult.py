@@ -63,7 +63,7 @@ def designs() -> dict[str, str]:
     """Texts of designs that are not packaged."""
     rng = np.random.default_rng(SEED)
     board, array = random_design("board", "board", rng), random_design("array", "array", rng)
-    head, _, rest = array.partition("[[electrode]]")
+    _, _, rest = array.partition("[[electrode]]")
     room = 'name="array in a room"\n[domain]\nsize=[10.0,10.0,10.0]\nbackplane=0.5\n'
     small = 'name="open array"\n[domain]\nsize=[0.3,0.3,0.3]\nbackplane=0.15\nopen=true\n'
     square = '[[electrode]]\nname="E1"\nshape="rectangle"\nsize=[0.1,0.1]\ncenter=[0.0,0.0]\n'

@@ -52,7 +52,7 @@ def test_the_inside_of_an_open_surface() -> None:
 
 
 def test_rigid_shape_with_screened_panels() -> None:
-    """Limits: a ball within a ball has no charge, yet its panels count for a tenth of the mean."""
+    """Limits: a ball in a ball has no charge, yet its panels have a tenth of the mean density."""
     balls = [trimesh.creation.icosphere(2, radius).triangles for radius in (0.02, 0.008)]
     shape = rigid.rigid_shape(panels_of(np.concatenate(balls), 60))
     assert shape.capacitance == approx(0.02, rel=0.01)
