@@ -129,8 +129,11 @@ def scenes(texts: dict[str, str]) -> list[Row]:
         for gap, kind in ((0.005, "grounded"), (0.002, "floating"), (0.001, "grounded")):
             body = item("capsule", [thin, 0.04], (x, y + 0.1 * width, gap + thin), kind, LEVEL)
             add(f"wire {kind} {1e3 * gap:g} mm", design, body)
-        add("wire tilted 2 mm", design,
-            item("capsule", [thin, 0.04], (x, y, 0.002 + thin + 0.01), way=turn("y", 60)))  # fmt: skip
+        add(
+            "wire tilted 2 mm",
+            design,
+            item("capsule", [thin, 0.04], (x, y, 0.002 + thin + 0.01), way=turn("y", 60)),
+        )
         add("wire of 0.3 m, 10 mm", design,
             item("capsule", [thin, 0.3], (x, y, 0.01 + thin), way=LEVEL))  # fmt: skip
         r, length = 3e-4, 0.04
@@ -190,8 +193,11 @@ def write(path: Path, cases: list[Row], texts: dict[str, str]) -> None:
             "what that adds, over the largest entry.")  # fmt: skip
     rows = ",\n".join(f"  {json.dumps(c)}" for c in cases)
     lines = ",\n".join(f"  {json.dumps(n)}: {json.dumps(t)}" for n, t in texts.items())
-    path.write_text(f'{{\n "note": {json.dumps(note, ensure_ascii=False)},\n "designs": '
-                    f'{{\n{lines}\n }},\n "cases": [\n{rows}\n ]\n}}\n', encoding="utf-8")  # fmt: skip
+    path.write_text(
+        f'{{\n "note": {json.dumps(note, ensure_ascii=False)},\n "designs": '
+        f'{{\n{lines}\n }},\n "cases": [\n{rows}\n ]\n}}\n',
+        encoding="utf-8",
+    )
 
 
 def make(only: str, again: bool) -> None:
@@ -214,8 +220,18 @@ def make(only: str, again: bool) -> None:
                   f"adds {case['error']:.2%}, panels {case['panels']}, {case['seconds']} s",
                   flush=True)  # fmt: skip
             cases.append(case)
-        write(DIFFICULT, [*cases, *(c for c in old if not any(
-            (c["name"], c["design"]) == (k["name"], k["design"]) for k in cases))], texts)  # fmt: skip
+        write(
+            DIFFICULT,
+            [
+                *cases,
+                *(
+                    c
+                    for c in old
+                    if not any((c["name"], c["design"]) == (k["name"], k["design"]) for k in cases)
+                ),
+            ],
+            texts,
+        )
 
 
 def measure(sim: cs.Simulator, case: Row) -> Row:

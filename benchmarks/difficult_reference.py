@@ -19,6 +19,7 @@ import math
 import sys
 import time
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +180,7 @@ def sheet(layout: Layout, body: Row, half: tuple[float, float], scale: float, z:
 def cup_line(points: Array, wall: float, scale: float, most: float) -> Array:
     """Outline of a cup through its corners, small steps at these."""
     out = [points[:1]]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         least = [scale * CORNER * wall if p[0] > 0 else scale * most for p in (a, b)]
         out.append(graded_line(a, b, (least[0], least[1]), scale * most)[1:])
     return np.concatenate(out)
@@ -196,8 +197,16 @@ def pieces(layout: Layout, bodies: list[Row], scale: float) -> tuple[list[Piece]
         low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
         for axis in (0, 1):
             for at in {float(low[axis]), float(high[axis])}:
-                features.append(Feature(axis, round(at, 9), float(low[1 - axis]),
-                                        float(high[1 - axis]), layout.top, SHARE * gap))  # fmt: skip
+                features.append(
+                    Feature(
+                        axis,
+                        round(at, 9),
+                        float(low[1 - axis]),
+                        float(high[1 - axis]),
+                        layout.top,
+                        SHARE * gap,
+                    )
+                )
 
     water = next((b for b in bodies if b["shape"] == "prism"), None)
     for k, body in enumerate(bodies):
@@ -239,7 +248,7 @@ def pieces(layout: Layout, bodies: list[Row], scale: float) -> tuple[list[Piece]
             lines = [rims(layout, axis) - body["position"][axis] for axis in (0, 1)]
             gap = body["position"][2] - size[2] / 2 - layout.top
             half = np.array(size) / 2
-            corners = box_panels(half, lambda x: np.full(len(x), scale * 0.36 * half[0]),
+            corners = box_panels(half, lambda x, most=0.36 * half[0]: np.full(len(x), scale * most),
                                  16 / scale, (*lines, scale * SHARE * gap))  # fmt: skip
             out.append(Piece(placed(body, corners), number))
             under(np.array(body["position"]) + np.array([[-1, -1, 0], [1, 1, 0]]) * half, gap)
@@ -277,8 +286,15 @@ def pieces(layout: Layout, bodies: list[Row], scale: float) -> tuple[list[Piece]
                 top = np.array([wet, [0.0, level]])
                 liquid = float(water["eps_r"])
 
-                def add(points: Array, front: float, back: float, shells: dict[str, float],
-                        body: Row = body, wall: float = wall, most: float = most) -> None:  # fmt: skip
+                def add(
+                    points: Array,
+                    front: float,
+                    back: float,
+                    shells: dict[str, float],
+                    body: Row = body,
+                    wall: float = wall,
+                    most: float = most,
+                ) -> None:
                     line = cup_line(points, wall, scale, most)
                     panels = placed(body, faceted(line, round(3 / scale)))
                     out.append(Piece(panels, -1, front, back, shells))
