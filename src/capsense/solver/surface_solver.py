@@ -50,9 +50,13 @@ Array = NDArray[np.float64]
 
 _OF_MANY = 0.4
 """Panels of one part of a large mesh, over those of a body."""
+_COMMON = 0.3
+"""Share of what bodies change that is in doubt where a dielectric lies within another's bounds."""
 _NO_SOLUTION = "the system matrix is singular; do two bodies coincide?"
 _LARGE = 0.4
 """Meshes that are longer than this [m] are solved for part by part."""
+_SAME = 1e-6
+"""Bounding boxes are the same that differ by less than this part of their size."""
 _LAYOUTS = 32
 """So many layouts of bodies are kept."""
 _NARROW = 8e-3
@@ -244,10 +248,15 @@ class SurfaceSolver:
         self._last = view, solution
         matrix, error = self.unit * solution.delta, self.unit * solution.error
         change = self._change(view, bodies, matrix, error, solution.size)
-        return replace(change, jacobian=slope, reason=partial(self._reason, bodies, solution))
+        return replace(change, jacobian=slope, reason=partial(self._reason, view, bodies, solution))
 
-    def _reason(self, bodies: PackedBodies, solution: Solution) -> str:
+    def _reason(self, view: View, bodies: PackedBodies, solution: Solution) -> str:
         """What most of the estimated error comes from, in words."""
+        if self._fills(view):
+            return (
+                "a dielectric lies within another one, and the charges of a face that they share "
+                "are not resolved; solve for one body of the outer shape instead"
+            )
         if solution.shift > 0.0:
             return "bodies lie within each other or within the sensor"
         close = f"nearer than {2e3 * self.length * self.green.gap.validity:.2g} mm"
@@ -261,6 +270,8 @@ class SurfaceSolver:
         self, view: View, bodies: PackedBodies, matrix: NDArray[Any], error: float, size: int
     ) -> CapacitanceChange:
         """What a scene changes, by its matrix [F] and the error of that."""
+        if self._fills(view):
+            error = max(error, _COMMON * float(np.abs(matrix).max()))
         if self._meets_electrodes(view):
             error = math.inf
         loss = -matrix.imag if np.iscomplexobj(matrix) else None
@@ -298,6 +309,21 @@ class SurfaceSolver:
                 else:
                     out[k] = SolveError(_NO_SOLUTION)
         return [out[k] for k in range(len(scenes))]
+
+    @staticmethod
+    def _fills(view: View) -> bool:
+        """Whether a dielectric lies within the bounding box of another, as water in a glass.
+
+        At a face of two dielectrics the charges of both nearly cancel. Clusters of different bodies
+        meet each other as four points, which leave as much of a gap between them.
+        """
+        places = np.flatnonzero(~view.matter.conducting)
+        if len(places) < 2:
+            return False
+        low, high = view.packed.bounds[view.met[places]].transpose(1, 0, 2)
+        grain = _SAME * (high - low).max()
+        inside = (low[:, None] >= low - grain) & (high[:, None] <= high + grain)
+        return int(inside.all(axis=2).sum()) > len(places)
 
     def _meets_electrodes(self, view: View) -> bool:
         """Whether an electrode lies inside a body, or touches a conductor.

@@ -180,6 +180,19 @@ def _second_extent(body):
     return 2.0 * max(min(a, b), min(max(a, b), c))
 
 
+@compiled
+def slenderness(bodies, near, length):
+    """How slender the most slender of the near bodies is, 0 to 1.
+
+    0 where the second-largest extent is a length [m] or more, 1 where it is nothing beside that.
+    """
+    out = 0.0
+    for b in range(bodies.shape[0]):
+        if near[b] and bodies[b].outline != CHANGING:
+            out = max(out, 1.0 - _second_extent(bodies[b]) / length)
+    return out
+
+
 @kernel
 def _extent(body):
     """The largest extent of an outline [m]."""

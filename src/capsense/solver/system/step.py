@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
-from capsense.solver.gap.body_gap_kernels import Facing, add_between, facing_of, hold_apart, mark
+from capsense.solver.gap.body_gap_kernels import (
+    Facing,
+    add_between,
+    facing_of,
+    hold_apart,
+    mark,
+    slenderness,
+)
 from capsense.solver.gap.gap_kernels import (
     extent_of_body,
     fabric_change,
@@ -240,15 +247,22 @@ def solve_lifted(
         system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
-    weights = np.zeros((m, m))
+    weights, doubt = np.zeros((m, m)), 0.0
     if near.any() or tied:
+        thin, plain = slenderness(bodies, lifted, green.gap.validity), delta.copy()
         local_change(bodies, lifted, node, green, delta)
         add_between(placed_as, facing, node, delta)
         add_ties(bodies, node, green.local, delta)
         weights = potentials_of(delta, m, nodes, capacitance)
         delta, left = congruent(weights, delta, capacitance), congruent(weights, left, np.zeros(0))
         charge, coarse = mixed(charge, weights, green.phi_columns), coarse_of(coarse, weights)
-    error = estimate(delta, left, coarse[:m], shift, green.electrodes)
+        if thin > 0.0:  # the local change is that by a plane in front of the design
+            add_ties(bodies, node, green.local, plain)
+            before = potentials_of(plain, m, nodes, capacitance)
+            plain = congruent(before, plain, capacitance)
+            for i in range(green.electrodes):
+                doubt = max(doubt, thin * abs(delta[i, i] - plain[i, i]))
+    error = estimate(delta, left, coarse[:m], shift, green.electrodes) + doubt
     return Solution(
         delta[:m, :m],
         left[:m, :m],

@@ -28,12 +28,12 @@ from capsense.solver.tree.dynamic_surface import DynamicBody
 from capsense.solver.tree.mean_kernels import means_between, patch_means, points_of_each
 from capsense.solver.tree.rigid import (
     HALF_SPACE,
-    LEAST_CHARGE,
     Clusters,
     equilibrium,
     features,
     once,
     split,
+    spread_out,
 )
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ least so many times as thick as these are wide: edges and two near faces take fi
 _FINER, _THIN, _THINNER, _BROAD = 2000, 1.2, 0.6, 0.02
 """… which are so many, and do not do for shapes less than 1.2 times as thick as these are wide, or
 0.6 times where they are wider than the last [m]: other panels would then be much too wide."""
-_FOIL = 5e-5
+_FOIL = 5e-4
 """Primitives thinner than this part of their width have no energies: their faces would be one."""
 FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 """Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
@@ -119,9 +119,22 @@ def _mean_thickness(mesh: TriMesh) -> float:
     """Twice the volume of a closed mesh over its surface, which of a plate is its thickness [m]."""
     if not mesh.closed:
         return 0.0
+    return 2.0 * abs(enclosed_volume(mesh.vertices, mesh.faces)) / _area(mesh)
+
+
+def _area(mesh: TriMesh) -> float:
+    """Surface of a mesh [m²]."""
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-    return 2.0 * abs(enclosed_volume(mesh.vertices, mesh.faces)) / area
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+
+
+def wall_squares(mesh: TriMesh) -> float:
+    """Surface of a closed mesh over the square of its mean thickness; 0 for an open one."""
+    held: float | None = mesh.__dict__.get("_wall_squares")
+    if held is None:
+        area, thickness = _area(mesh), _mean_thickness(mesh)
+        held = mesh.__dict__["_wall_squares"] = area / thickness**2 if thickness > 0.0 else 0.0
+    return held
 
 
 def wide_pieces(shape: Shape, conducting: bool, largest: float, finest: float | None = None) -> int:
@@ -222,9 +235,7 @@ def _equilibrium(panels: SurfacePanels, cluster: Ints) -> Array:
         charge = equilibrium(patch_means(center, area), left=_LEFT)
     except SolveError:  # of faces that coincide
         return panels.areas
-    return (
-        np.asarray(np.maximum(charge, LEAST_CHARGE * charge.max()) / area)[cluster] * panels.areas
-    )
+    return np.asarray((spread_out(charge, area) / area)[cluster] * panels.areas)
 
 
 class FinePanelBody(DynamicBody):

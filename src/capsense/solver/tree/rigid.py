@@ -46,8 +46,10 @@ _EXTRA = 0.0, 1e-3, 1e-2, 0.1
 """What is added to the panels' own energies, relative, where some nearly coincide."""
 _LEFT, _MOST_STEPS = 1e-8, 1000
 """Conjugate gradients end when so little of the residual is left, or after so many steps."""
-LEAST_CHARGE = 1e-6
-"""Smallest charge of a panel, as a part of the largest: those within a cavity have none."""
+_LEAST_DENSITY = 0.1
+"""Smallest charge density of a panel over the mean one. Panels of convex bodies have more; those
+within a cavity have next to none, by many orders, and functions weighted with that would leave most
+of its surface without charge."""
 BODY = np.dtype(
     [
         ("n", np.int64),  # panels, or parts of them; there are 2 n - 1 clusters
@@ -203,8 +205,13 @@ def rigid_shape(panels: SurfacePanels, *, apart: bool = False, most: float = np.
     """
     free = free_block(panels)
     charge = equilibrium(free, panels.mirrors) if apart else _made_definite(free)
-    tree = build_tree(panels, np.maximum(charge, LEAST_CHARGE * charge.max()), most)
+    tree = build_tree(panels, spread_out(charge, panels.areas), most)
     return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
+
+
+def spread_out(charge: Array, areas: Array) -> Array:
+    """Charges (n,) of panels, raised to a least density, see :data:`_LEAST_DENSITY`."""
+    return np.asarray(np.maximum(charge, _LEAST_DENSITY * charge.sum() / areas.sum() * areas))
 
 
 def equilibrium(free: Array, mirrors: Mirrors | None = None, left: float = _LEFT) -> Array:

@@ -34,7 +34,13 @@ from capsense.scene.shapes import ShapeKind
 from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import panels_of, polygon_panels
 from capsense.solver.tree.dynamic_surface import DynamicBody, layer_pieces, mesh_pieces
-from capsense.solver.tree.fine_panels import FACES, FinePanelBody, wide_body, wide_pieces
+from capsense.solver.tree.fine_panels import (
+    FACES,
+    FinePanelBody,
+    wall_squares,
+    wide_body,
+    wide_pieces,
+)
 from capsense.solver.tree.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.solver.tree.subpanels import refined
 
@@ -92,7 +98,7 @@ def standing(vertices: Array, faces: NDArray[np.int64]) -> PrincipalFrame:
     return PrincipalFrame(grid * own[order][place[np.lexsort(place.T[::-1])]], axes, middle)
 
 
-VERSION = 9
+VERSION = 10
 """Of stored shapes: to be raised when the same mesh would get other panels or functions."""
 
 _log = logging.getLogger(__name__)
@@ -114,6 +120,9 @@ _EACH = 0.2
 """Triangles for each part of a mesh of several parts, over the panels of a primitive."""
 _MOST = 2.8
 """No mesh has more triangles than so many times that."""
+_WALLS = 2.0
+"""Triangles of a dielectric mesh are no wider than so many times its mean thickness, as far as that
+many do."""
 
 _LOCK = ForkSafeRLock()
 _SHAPES: OrderedDict[Hashable, RigidShape | DynamicBody] = OrderedDict()
@@ -149,6 +158,9 @@ def functions_of(
         return in_pieces(shape, pieces, conducting)
     if not conducting:
         finest = None
+        if isinstance(shape, TriMesh):  # a wall is polarised by the difference of its two faces
+            needed = round(wall_squares(shape) / (_WALLS**2 * _TRIANGLES))
+            count = max(count, min(needed, round(_MOST / _TRIANGLES * count)))
     if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER):
         edged = 2 * count if finest is None else max(_EDGED, round(_MORE * count))
         count = min(2 * count, edged)
