@@ -259,7 +259,8 @@ def test_one_warning_tells_of_all_large_estimated_errors() -> None:
     assert len(doubts) >= 2
     worst = max(doubts, key=lambda name: doubts[name].share)
     text = str(told[0].message)
-    assert text.startswith(f"{len(doubts)} of 4 sensors") and f"the worst is {worst!r}" in text
+    assert text.startswith(f"{len(doubts)} of 4 sensors")
+    assert f"the worst is {worst!r}" in text
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         skin.step(cs.Scene(person))
