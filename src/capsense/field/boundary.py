@@ -19,7 +19,7 @@ from shapely.geometry import Polygon
 
 from capsense.constants import UNIT
 from capsense.design.geometry import Facet
-from capsense.design.model import LOCAL_GROUND, Conductor, Design, Electrode, Role
+from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field import bem_kernels as kernels
 from capsense.field.bem_kernels import Panels
@@ -46,8 +46,6 @@ _FEW_FACETS = 64
 """Sheets of more facets than this are curved; their facets are not searched for narrow gaps."""
 _FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
-SEVERAL, _EACH = 24, 70
-"""Designs of more terminals than this are cut coarser from so many panels each on."""
 _FINEST, _COARSEST = 0.5, 8.0
 """The finest, and where the search begins, as multiples of the default sizes."""
 POWER = 1.7
@@ -99,23 +97,11 @@ def room_scale(design: Design) -> float:
 
 
 def terminals(design: Design) -> list[str]:
-    """Names of the conductors apart from earth: electrodes, then shields, then floating ones.
-
-    The last one is the local ground of a design whose conductors at ground are not earthed.
-    """
+    """Names of the conductors that can be driven: electrodes, then shields, then floating."""
     extra = [
         c for role in (Role.SHIELD, Role.FLOATING) for c in design.conductors if c.role == role
     ]
-    local = [LOCAL_GROUND] if design.local_ground else []
-    return [*design.electrode_names, *(c.name for c in extra), *local]
-
-
-def terminal_of(sheet: Electrode | Conductor, design: Design) -> int:
-    """Number of a sheet's terminal among :func:`terminals`, ``GROUND`` for earth."""
-    names = terminals(design)
-    if isinstance(sheet, Conductor) and sheet.role == Role.GROUND:
-        return len(names) - 1 if design.local_ground else GROUND
-    return names.index(sheet.name)
+    return [*design.electrode_names, *(c.name for c in extra)]
 
 
 def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryModel:
@@ -153,20 +139,16 @@ def _fitted(design: Design) -> float:
 
     Sizes are halved from the coarsest on, so that no cut has many more panels than are allowed.
     """
-    count_of_terminals = len(terminals(design))
-    most = _MANY
-    if count_of_terminals > SEVERAL:
-        most = min(_MANY, max(_FEW, _EACH * count_of_terminals))
 
     def count_at(scale: float) -> int:
         return sum(len(part.pieces) for part in _pieces(design, scale))
 
     scale, count = _COARSEST, count_at(_COARSEST)
-    while scale > 1.0 and count * 2**POWER < 1.5 * most:
+    while scale > 1.0 and count * 2**POWER < 1.5 * _MANY:
         scale /= 2
         count = count_at(scale)
-    if scale > 1.0 or count > most:
-        return scale * (count / most) ** (1 / POWER)
+    if scale > 1.0 or count > _MANY:
+        return scale * (count / _MANY) ** (1 / POWER)
     return float(np.clip((count / _FEW) ** (1 / POWER), _FINEST, 1.0))
 
 
@@ -182,10 +164,11 @@ class _CutFacet(NamedTuple):
 def _pieces(design: Design, scale: float) -> list[_CutFacet]:
     """Cut facets of sheets, then interfaces, then walls into pieces of the default sizes times
     ``scale``."""
+    names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
     flat: list[bool] = []
     for body in design.sheets:
-        owner = terminal_of(body, design)
+        owner = names.index(body.name) if body.name in names else GROUND
         for facet in body.surface.facets:
             sheets.append((facet, owner))
             flat.append(len(body.surface.facets) <= _FEW_FACETS)

@@ -144,12 +144,11 @@ class FacePlane(NamedTuple):
         )  # fmt: skip
 
 
-def plane_panels(solution: BoundarySolution, reach: float, smallest: float = 0.0) -> FacePlane:
+def plane_panels(solution: BoundarySolution, reach: float) -> FacePlane:
     """Panels of a plane that follow the outlines of the sheets behind it.
 
     Above the electrodes they are the electrodes' own, so that no panel lies across a rim.
-    ``reach`` is how far it goes beyond the electrodes [m], and ``smallest`` the size of cells that
-    are not cut further [m].
+    ``reach`` is how far it goes beyond the electrodes [m].
     """
     design = solution.design
     film = design.film
@@ -194,26 +193,18 @@ def plane_panels(solution: BoundarySolution, reach: float, smallest: float = 0.0
         outline = facet.footprint
         if not rest.intersects(outline):
             continue
-        add(rest.intersection(outline), _no_finer(grading, smallest), outline.bounds)
+        add(rest.intersection(outline), grading, outline.bounds)
         rest = rest.difference(outline)
     grading = sheets[-1][1]
     off = replace(
         grading, edge=_OFF * grading.edge, smallest=_OFF * grading.smallest,
         largest=_OFF * grading.largest,
     )  # fmt: skip
-    add(rest, _no_finer(off, smallest), rest.bounds)
+    add(rest, off, rest.bounds)
     panels = concatenate(parts)
     if film is None:
         return FacePlane(panels)
     return FacePlane(panels, tuple(bent), np.repeat(np.arange(len(bent)), counts), film.radius)
-
-
-def _no_finer(grading: Grading, size: float) -> Grading:
-    """A grading without bands and cells smaller than a size [m]."""
-    return replace(
-        grading, edge=max(grading.edge, size / grading.aspect),
-        smallest=max(grading.smallest, size), largest=max(grading.largest, size),
-    )  # fmt: skip
 
 
 def _sheets_of(solution: BoundarySolution) -> list[tuple[Facet, Grading]]:

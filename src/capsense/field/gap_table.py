@@ -27,7 +27,6 @@ from capsense.field.bem_kernels import Panels
 from capsense.field.boundary import (
     INTERFACE,
     POWER,
-    SEVERAL,
     Accuracy,
     BoundarySolution,
 )
@@ -53,12 +52,8 @@ _EXACT = 0.02
 """Largest relative error of a plate's energy from the validity distance on."""
 _PLATE = 0.5
 """Side of the small plates, over that of the electrodes."""
-_MOST, _FEWER = 3500, 2200
-"""About the most boundary elements that a table is made from: of designs of a few terminals, and of
-those of more."""
-_COARSER = 0.5
-"""In front of designs of more terminals, cells of the plane are no smaller than this part of its
-height."""
+_MOST = 3500
+"""About the most boundary elements that a table is made from."""
 _BLOCK = 6
 """Cells lie in blocks of so many in a row."""
 _DEEP = 3.0
@@ -150,9 +145,8 @@ def gap_table_of(
         progress: Called with what is being done.
     """
     count = solution.model.panels.size
-    most = _FEWER if solution.model.n_terminals > SEVERAL else _MOST
-    if count > most:
-        scale = max(panel_scale, 1.0) * (count / most) ** (1 / POWER)
+    if count > _MOST:
+        scale = max(panel_scale, 1.0) * (count / _MOST) ** (1 / POWER)
         solution = BoundarySolution(solution.design, Accuracy(scale))
     densities = solution.densities(np.eye(solution.model.n_terminals))
     table = build_gap_table(solution, densities, green.clearance, green, progress)
@@ -179,16 +173,12 @@ def build_gap_table(
     """
     model = solution.model
     design, heights = solution.design, np.asarray(unit * _HEIGHTS, float)
-    reach, top = _MARGIN * unit, top_of(design)
-    plane = plane_panels(solution, reach)
+    plane, top = plane_panels(solution, _MARGIN * unit), top_of(design)
     plates = plates_of(plane.panels, design)
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
     response, errors = PlaneResponse(solution), np.full(len(heights), np.inf)
     for k, height in enumerate(heights):
         progress(f"response to a plane: {k + 1} of {len(heights)}")
-        if model.n_terminals > SEVERAL:
-            plane = plane_panels(solution, reach, _COARSER * height)
-            plates = plates_of(plane.panels, design)
         panels = plane.at(top + height)
         found = response.at(panels, densities)
         changes[k] = found.change[: model.sheet_panels]
