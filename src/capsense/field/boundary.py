@@ -19,7 +19,7 @@ from shapely.geometry import Polygon
 
 from capsense.constants import UNIT
 from capsense.design.geometry import Facet
-from capsense.design.model import Design, Role
+from capsense.design.model import LOCAL_GROUND, Conductor, Design, Electrode, Role
 from capsense.errors import FieldError
 from capsense.field import bem_kernels as kernels
 from capsense.field.bem_kernels import Panels
@@ -97,11 +97,23 @@ def room_scale(design: Design) -> float:
 
 
 def terminals(design: Design) -> list[str]:
-    """Names of the conductors that can be driven: electrodes, then shields, then floating."""
+    """Names of the conductors apart from earth: electrodes, then shields, then floating ones.
+
+    The last one is the local ground of a design whose conductors at ground are not earthed.
+    """
     extra = [
         c for role in (Role.SHIELD, Role.FLOATING) for c in design.conductors if c.role == role
     ]
-    return [*design.electrode_names, *(c.name for c in extra)]
+    local = [LOCAL_GROUND] if design.local_ground else []
+    return [*design.electrode_names, *(c.name for c in extra), *local]
+
+
+def terminal_of(sheet: Electrode | Conductor, design: Design) -> int:
+    """Number of a sheet's terminal among :func:`terminals`, ``GROUND`` for earth."""
+    names = terminals(design)
+    if isinstance(sheet, Conductor) and sheet.role == Role.GROUND:
+        return len(names) - 1 if design.local_ground else GROUND
+    return names.index(sheet.name)
 
 
 def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryModel:
@@ -164,11 +176,10 @@ class _CutFacet(NamedTuple):
 def _pieces(design: Design, scale: float) -> list[_CutFacet]:
     """Cut facets of sheets, then interfaces, then walls into pieces of the default sizes times
     ``scale``."""
-    names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
     flat: list[bool] = []
     for body in design.sheets:
-        owner = names.index(body.name) if body.name in names else GROUND
+        owner = terminal_of(body, design)
         for facet in body.surface.facets:
             sheets.append((facet, owner))
             flat.append(len(body.surface.facets) <= _FEW_FACETS)

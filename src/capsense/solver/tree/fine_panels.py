@@ -229,7 +229,7 @@ def _equilibrium(panels: SurfacePanels, cluster: Ints) -> Array:
     Limbs and edges carry more than their share of the surface. What is wrong here, functions of
     smaller clusters make right.
     """
-    area = np.bincount(cluster, panels.areas)
+    area: Array = np.bincount(cluster, panels.areas).astype(float)
     center = np.stack([np.bincount(cluster, panels.areas * x) / area for x in panels.centers.T])
     try:
         charge = equilibrium(patch_means(center, area), left=_LEFT)
