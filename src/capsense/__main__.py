@@ -49,7 +49,8 @@ exit codes:
   1    failed for a reason that is not your input: a step that was not solved, a full
        disk, a bug (what was computed until then is kept)
   2    bad usage or input; the message names what is wrong and how to fix it
-  3    reproduce: it ran, and a figure missed its target; replay: a reading differs
+  3    reproduce: it ran, and a figure missed its target; replay: a reading differs;
+       design: the tolerance is not met
   130  interrupted by Ctrl-C or a request to terminate (what was computed is kept)
 """
 

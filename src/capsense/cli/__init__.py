@@ -109,6 +109,14 @@ def count_of(text: str) -> int:
     return value
 
 
+def share(text: str) -> float:
+    """A part of the whole from the command line, such as 1% or 0.01."""
+    value = float(text[:-1]) / 100 if text.endswith("%") else float(text)
+    if not 0.0 < value < 1.0:
+        raise argparse.ArgumentTypeError(f"{text}; give a part above 0 and below 1, such as 1%")
+    return value
+
+
 def check_picture(option: str, path: Path, error: type[CapSenseError]) -> None:
     """Refuse before any computation what Matplotlib would refuse after it."""
     if path.suffix.lower() not in PICTURES:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from capsense.cli import (
     OK,
     PICTURES,
+    TARGET_MISSED,
     BuildProgress,
     arg,
     check_picture,
@@ -17,6 +18,8 @@ from capsense.cli import (
     facts,
     field_figures,
     grouped,
+    say,
+    share,
     table,
 )
 from capsense.errors import DesignError
@@ -37,6 +40,11 @@ if TYPE_CHECKING:
         type=Path,
     ),
     arg("--no-build", "leave out the field's figures and the baseline"),
+    arg(
+        "--tolerance SHARE",
+        "refine panels until each entry of the baseline is this accurate, such as 1%%; no field",
+        type=share,
+    ),
     arg("-q --quiet", "no progress bar"),
 )
 def design(args: argparse.Namespace) -> int:
@@ -49,6 +57,7 @@ def design(args: argparse.Namespace) -> int:
       capsense design six_patch
       capsense design stripe --no-build -o stripe.png     draw it: top view and stack
       capsense design my/sensor.toml
+      capsense design six_patch --tolerance 1%            the resolution that this asks for
     """
 
     if args.list:
@@ -73,6 +82,8 @@ def design(args: argparse.Namespace) -> int:
     else:
         design_file, picture = (shlex.quote(x) for x in (args.design, f"{design.name}.png"))
         print(f"\ndraw it with: capsense design {design_file} --no-build -o {picture}")
+    if args.tolerance is not None:
+        return _refined(design, args.tolerance, quiet=args.quiet)
     if not args.no_build:
         import capsense
 
@@ -80,6 +91,38 @@ def design(args: argparse.Namespace) -> int:
             simulator = capsense.Simulator(design, progress=progress)
         print(f"\n{describe_field(simulator)}")
     return OK
+
+
+def _refined(design: Design, tolerance: float, *, quiet: bool) -> int:
+    """Print the resolution that meets a tolerance, capacitances and their estimated errors."""
+    from capsense.field.refinement import refine
+
+    def tell(stage: str) -> None:
+        if not quiet and stage.endswith("panels"):
+            say(stage)
+
+    found = refine(design, tolerance, tell)
+    names, own = design.electrode_names, float(design.build.get("resolution", 1.0))
+    worst = f"{100 * found.errors.max():.2g} %"
+    print()
+    print(
+        facts([
+            ("tolerance", f"{100 * tolerance:g} %, {'met' if found.met else 'NOT met'}"),
+            ("largest estimated error", worst),
+            ("boundary panels", grouped(found.panels)),
+            ("resolution", f"{found.resolution:.3g} under [build]; the design has {own:g}"),
+        ])
+    )  # fmt: skip
+    for head, values, form in (
+        ("baseline [pF]", 1e12 * found.capacitance, ".4f"),
+        ("error [%]", 100 * found.errors, ".2g"),
+    ):
+        rows = [
+            (name, *(format(value, form) for value in row))
+            for name, row in zip(names, values, strict=True)
+        ]
+        print(f"\n{table((head, *names), rows)}")
+    return OK if found.met else TARGET_MISSED
 
 
 def _listing() -> str:

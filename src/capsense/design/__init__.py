@@ -32,7 +32,16 @@ from capsense.design.geometry import (
     length_unit,
     read_placement,
 )
-from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role, check_design
+from capsense.design.model import (
+    RESOLUTIONS,
+    Conductor,
+    Design,
+    Domain,
+    Electrode,
+    Layer,
+    Role,
+    check_design,
+)
 from capsense.design.shapes import (
     SHAPES,
     box_surface,
@@ -227,7 +236,7 @@ def _read_domain(table: DesignTable) -> Domain:
 
 def _read_build(table: DesignTable) -> dict[str, float]:
     table.only(("resolution",))
-    return {"resolution": table.number("resolution", 0.25, 4.0, 1.0)}
+    return {"resolution": table.number("resolution", *RESOLUTIONS, 1.0)}
 
 
 def _read_surface(

@@ -35,6 +35,8 @@ from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
 
+RESOLUTIONS = 0.25, 4.0
+"""The smallest and the largest ``[build] resolution``."""
 _INFINITY = 1e5
 """How many box sizes below an open domain its ground lies."""
 _LARGEST_TIE = 1e-3

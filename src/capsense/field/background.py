@@ -116,7 +116,7 @@ def build_background(
             tell(stage, _STAGES.get(stage, 0.0))
 
     names, unit = tuple(terminals(design)), design.unit
-    solution, densities, capacitance = _solve_empty(design, settings, begin)
+    solution, densities, capacitance = solve_empty(design, settings, begin)
     green = build_green(solution, densities, begin)
     if has_even_face(solution.design):
         table = gap_table_of(solution, settings.panel_scale, green, begin)
@@ -137,10 +137,10 @@ def empty_capacitance(design: Design, settings: BuildSettings | None = None) -> 
     Raises:
         FieldError: The geometry needs more panels than fit, or a result is not finite.
     """
-    return _solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
+    return solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
 
 
-def _solve_empty(
+def solve_empty(
     design: Design, settings: BuildSettings, begin: Callable[[str], None]
 ) -> tuple[BoundarySolution, Array, Array]:
     """Boundary elements in the design's unit, their densities, and the Maxwell matrix [F]."""

@@ -187,3 +187,23 @@ def test_small_texts() -> None:
     ]
     assert [grouped(v) for v in (1234567, 12, 0.123456, "x")] == ["1 234 567", "12", "0.1235", "x"]
     assert facts([("a", "1"), ("bcd", "2")]) == "a    1\nbcd  2"
+
+
+def test_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The resolution for a tolerance is told; it ends with 3 where no panels meet it."""
+    file = tmp_path / "pad.toml"
+    file.write_text(
+        'name = "pad"\n[domain]\nsize = [0.2, 0.2, 0.2]\nbackplane = 0.01\n'
+        '[build]\nresolution = 0.25\n[[electrode]]\nname = "A"\nshape = "disc"\nradius = 0.01\n'
+    )
+    assert main(["design", str(file), "--tolerance", "2%", "-q"]) == 0
+    text, errors = capsys.readouterr()
+    assert errors == ""
+    assert "tolerance                2 %, met" in text
+    assert re.search(r"resolution +[\d.]+ under \[build\]; the design has 0\.25", text)
+    assert re.search(r"baseline \[pF\] +A\nA +\d\.\d{4}\n\nerror \[%\] +A\nA +[\d.]+\n", text)
+    assert main(["design", str(file), "--tolerance", "1e-9", "-q"]) == 3
+    assert "NOT met" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["design", str(file), "--tolerance", "120%"])
+    assert "give a part above 0 and below 1" in capsys.readouterr().err
