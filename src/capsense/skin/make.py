@@ -20,6 +20,7 @@ from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Pose
 from capsense.scene.surface import connected_parts
+from capsense.skin.frames import read_frames
 from capsense.skin.layout import FLATTEST, Pad, SkinLayout, checked_length, pad_design
 from capsense.skin.surface import (
     Fit,
@@ -116,6 +117,7 @@ def from_taxels(
     taxels: str | Path | ArrayLike,
     normals: ArrayLike | None = None,
     *,
+    frames: str | None = None,
     link: object | None = None,
     pose: Pose | None = None,
     patch: Pad | Design | str | Path = _TAXEL,
@@ -126,11 +128,15 @@ def from_taxels(
     A ``.csv`` file has the columns x, y, z, nx, ny, nz and optionally name. A ``.txt`` or ``.ini``
     file has them, without a header, after the line ``[calibration]``, as the position files of
     iCub's skins do: lines of zeros stand for taxels that are not there, and of several taxels at
-    one place the first is taken. ``left_out`` of the layout names the others.
+    one place the first is taken. ``left_out`` of the layout names the others. Of a ``.urdf`` file,
+    the frames named by ``frames`` are taken, whose z axes point out of the link.
 
     Args:
         taxels: Path of a file, or positions, shape (n, 3).
         normals: Normals out of the link, shape (n, 3), with positions.
+        frames: With a ``.urdf`` file, which of its links are taxels, such as
+            ``"l_forearm_skin_*"``. One link must carry all of them by fixed joints: the first one
+            above them that a joint moves, or the root. Places are in its frame.
         link: Mesh of the link in its frame [m], from which electrodes take how they are bent; by
             default they are flat.
         pose: Frame of the taxels in the frame of the link.
@@ -142,8 +148,17 @@ def from_taxels(
         DesignError: The design is wrong.
     """
     chosen_patch, width = _checked_patch(patch)
+    urdf = isinstance(taxels, str | Path) and Path(taxels).suffix.lower() == ".urdf"
+    if urdf != (frames is not None):
+        raise SceneError(
+            f"frames is {frames!r}; give a pattern of link names with the path of a .urdf file, "
+            "and none without"
+        )
     if isinstance(taxels, str | Path):
-        found = read_taxels(Path(taxels), unit)
+        if frames is None:
+            found = read_taxels(Path(taxels), unit)
+        else:
+            found = _from_frames(Path(taxels), frames)
     else:
         found = _from_arrays(taxels, normals, unit)
     at = Pose() if pose is None else pose
@@ -152,16 +167,14 @@ def from_taxels(
         axes = np.eye(3)
         tree, samples = KDTree(points.points), Samples(np.zeros((0, 3)), np.zeros((0, 3)))
         flat = fit(points, Samples(points.points, -points.normals), tree, 1e-9, axes)
-        frames = Fit(flat.rotation, np.zeros((len(points.points), 2)))
+        fits = Fit(flat.rotation, np.zeros((len(points.points), 2)))
     else:
         mesh = read_link(link, "m")
         samples = sample(mesh, width)
         tree = KDTree(samples.points)
-        frames = fit(points, samples, tree, 0.5 * width, principal_axes(mesh))
-    designs = _designs(frames, chosen_patch)
-    return _layout(
-        found.names, points.points, frames, designs, samples, tree, found.left_out
-    ).warn()
+        fits = fit(points, samples, tree, 0.5 * width, principal_axes(mesh))
+    designs = _designs(fits, chosen_patch)
+    return _layout(found.names, points.points, fits, designs, samples, tree, found.left_out).warn()
 
 
 def paint(
@@ -421,6 +434,15 @@ def _matrix(rotation: Array, point: Array) -> Array:
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = rotation, point
     return out
+
+
+def _from_frames(path: Path, pattern: str) -> Taxels:
+    _, poses = read_frames(path, pattern)
+    rows = [
+        (f"{path}, link {name!r}", name, [*pose.position, *pose.rotation[:, 2]])
+        for name, pose in poses.items()
+    ]
+    return checked_taxels(rows, 1.0, str(path))
 
 
 def _from_arrays(positions: ArrayLike, normals: ArrayLike | None, unit: str) -> Taxels:

@@ -348,3 +348,56 @@ def test_taxels_bend_with_the_link() -> None:
         cs.skin.from_taxels(RADIUS * out)
     with pytest.raises(cs.SceneError, match="have shapes"):
         cs.skin.from_taxels(RADIUS * out, out[:3])
+
+
+URDF = """<robot name="r">
+  <link name="base"/><link name="arm"/><link name="cover"/>
+  <link name="skin_0"/><link name="skin_1"/><link name="tip_0"/>
+  <joint name="a" type="revolute"><parent link="base"/><child link="arm"/></joint>
+  <joint name="b" type="fixed"><parent link="arm"/><child link="cover"/>
+    <origin xyz="0 0 0.1" rpy="0 0 1.5707963267948966"/></joint>
+  <joint name="c" type="fixed"><parent link="cover"/><child link="skin_0"/>
+    <origin xyz="0.02 0 0" rpy="0 1.5707963267948966 0"/></joint>
+  <joint name="d" type="fixed"><parent link="arm"/><child link="skin_1"/>
+    <origin xyz="0 -0.03 0" rpy="1.5707963267948966 0 0"/></joint>
+  <joint name="e" type="continuous"><parent link="arm"/><child link="hand"/></joint>
+  <link name="hand"/>
+  <joint name="f" type="fixed"><parent link="hand"/><child link="tip_0"/></joint>
+</robot>"""
+
+
+def test_taxels_of_a_urdf(tmp_path: Path) -> None:
+    """Fixed joints are followed up to the link that moves; normals are the z axes."""
+    file = tmp_path / "model.urdf"
+    file.write_text(URDF)
+    layout = cs.skin.from_taxels(file, frames="skin_*")
+    poses = layout.poses()
+    assert list(poses) == ["skin_0", "skin_1"]
+    for name, place, normal in (
+        ("skin_0", (0.0, 0.02, 0.1), (0.0, 1.0, 0.0)),
+        ("skin_1", (0.0, -0.03, 0.0), (0.0, -1.0, 0.0)),
+    ):
+        np.testing.assert_allclose(poses[name].position, place, atol=1e-12)
+        np.testing.assert_allclose(poses[name].rotation[:, 2], normal, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "frames", "message"),
+    [
+        (URDF, "sleeve_*", "no link named 'sleeve_\\*'; its links are 'base', 'arm'"),
+        (URDF, "*_0", "'skin_0' is fixed to 'arm', but 'tip_0' to 'hand'"),
+        (URDF, None, "frames is None; give a pattern"),
+        ("robot", "skin_*", "is no XML"),
+        (URDF.replace("0 -0.03 0", "0 -0.03"), "skin_*", "xyz of link 'skin_1' is '0 -0.03'"),
+        (URDF.replace('parent link="base"', 'parent link="cover"'), "skin_*", "in a circle"),
+    ],
+)
+def test_wrong_frames(tmp_path: Path, text: str, frames: str | None, message: str) -> None:
+    file = tmp_path / "model.urdf"
+    file.write_text(text)
+    with pytest.raises(cs.SceneError, match=message):
+        cs.skin.from_taxels(file, frames=frames)
+    with pytest.raises(cs.SceneError, match="there is no URDF file"):
+        cs.skin.from_taxels(tmp_path / "none.urdf", frames="*")
+    with pytest.raises(cs.SceneError, match="and none without"):
+        cs.skin.from_taxels(np.zeros((1, 3)), np.ones((1, 3)), frames="*")
