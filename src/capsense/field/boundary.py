@@ -282,18 +282,39 @@ class BoundarySolution:
         driven = owner >= 0
         rhs[driven] = potentials[owner[driven]]
         if sources is not None:
-            rhs += self._source_terms(sources)
+            points = np.ascontiguousarray(sources)
+            rhs += self._source_terms(points, self._potentials(points))
         return UNIT * scipy.linalg.lu_solve(self._lu, rhs)
 
     def solve(self, sides: Array) -> Array:
         """Charge densities over 4π eps0 of right-hand sides in the order of the panels, (n, k)."""
         return scipy.linalg.lu_solve(self._lu, sides)
 
-    def _source_terms(self, sources: Array) -> Array:
+    def responses(self, points: Array, densities: Array) -> tuple[Array, Array]:
+        """Potentials at points [m] of what charges at all of them draw, and of densities.
+
+        Args:
+            points: Shape (n, 3). Each in turn has a point charge of 4π eps0 · 1 V·m, with all
+                terminals at ground.
+            densities: Charge densities on the panels [C/m²], shape (panels, k).
+
+        Returns:
+            The potentials of the charges that are drawn, without those of the point charges [V],
+            shape (n, n); and of the densities [V], shape (n, k).
+        """
+        points = np.ascontiguousarray(points)
+        potentials = self._potentials(points)
+        drawn = self.solve(self._source_terms(points, potentials))
+        return potentials @ drawn, potentials @ (densities / UNIT)
+
+    def _potentials(self, points: Array) -> Array:
+        """Potentials at points of unit densities, times 4π eps0, (n, 3) -> (n, panels)."""
+        return kernels.potential_matrix(points, self.model.floor, self.model.panels)
+
+    def _source_terms(self, points: Array, potentials: Array) -> Array:
         """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
         panels, floor = self.model.panels, self.model.floor
-        points = np.ascontiguousarray(sources)
-        rhs = -kernels.potential_matrix(points, floor, panels).T
+        rhs = -potentials.T
         rows = np.flatnonzero(self.model.owner == INTERFACE)
         if len(rows):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
@@ -329,6 +350,5 @@ class BoundarySolution:
         scaled = densities / UNIT
         for start in range(0, len(points), chunk):
             block = np.ascontiguousarray(points[start : start + chunk])
-            matrix = kernels.potential_matrix(block, self.model.floor, self.model.panels)
-            out[start : start + chunk] = matrix @ scaled
+            out[start : start + chunk] = self._potentials(block) @ scaled
         return out

@@ -197,9 +197,8 @@ def build_green(
     )
     points, distances = training_points(surface, near, settings)
     progress("response to charges: boundary elements")
-    answer = solution.densities(np.zeros((model.n_terminals, len(points))), points)
-    response = -solution.potential(points, answer)
-    phi = solution.potential(points, densities)
+    drawn, phi = solution.responses(points, densities)
+    response = -drawn
     progress("response to charges: fit")
     weight = _near_weight(distances)
     wanted = 0.5 * (response + response.T) * weight * weight.T
