@@ -310,11 +310,6 @@ def sweep(args: argparse.Namespace) -> int:
       capsense sweep patch --scenario a.toml --readout fdc1004 --vary wiring.trace=0,5pF -o t.csv
     """
     from capsense.studies import Capacitances
-    from capsense.studies.capacitances import (
-        load_design_template,
-        load_readout_template,
-        load_scenario_template,
-    )
     from capsense.studies.plots import check_plot, plot_sweep
     from capsense.studies.sweeps import grid, parse_steps, parse_vary, with_derivatives
 
@@ -329,11 +324,7 @@ def sweep(args: argparse.Namespace) -> int:
         points = grid(vary)
     except ValueError as error:
         raise ScenarioError(f"--vary: {error}") from None
-    capacitances = Capacitances.of(
-        load_design_template(args.design), points,
-        None if args.scenario is None else load_scenario_template(args.scenario),
-        None if args.readout is None else load_readout_template(args.readout),
-    )  # fmt: skip
+    capacitances = Capacitances.load(args.design, points, args.scenario, args.readout)
     steps = parse_steps(args.derivatives)
     evaluation = with_derivatives(capacitances, steps, points)
     chosen = [name for name in args.outputs.split(",") if name]

@@ -131,6 +131,22 @@ class Capacitances:
         assert first is not None
         raise first
 
+    @classmethod
+    def load(
+        cls,
+        design: str | Path,
+        points: Sequence[Point],
+        scenario: str | Path | None = None,
+        readout: str | Path | None = None,
+    ) -> Capacitances:
+        """As :meth:`of`, from the paths of files, or the names of a packaged design and a chip."""
+        return cls.of(
+            load_design_template(design),
+            points,
+            None if scenario is None else load_scenario_template(scenario),
+            None if readout is None else load_readout_template(readout),
+        )
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last": {}}
 

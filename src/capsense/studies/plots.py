@@ -46,9 +46,7 @@ def check_plot(
             f"--plot shows one or two parameters, and {len(changing)} change; leave it out, or "
             "give single values to the others"
         )
-    kinds: dict[str, list[str]] = {}
-    for output in outputs:
-        kinds.setdefault(output.partition("_")[0], []).append(output)
+    kinds = _by_kind(outputs)
     for name in chosen:
         if name not in outputs and name not in kinds:
             raise ScenarioError(f"--outputs: {name!r} is no output; {suggest(name, outputs)}")
@@ -86,9 +84,7 @@ def plot_sweep(
     results = np.array([row.results for row in rows])
     columns = {name: results[:, outputs.index(name)] for name in shown}
     if len(changing) == 1:
-        kinds: dict[str, list[str]] = {}
-        for name in shown:
-            kinds.setdefault(name.partition("_")[0], []).append(name)
+        kinds = _by_kind(shown)
         figure = Figure(figsize=(7, 0.6 + 2.6 * len(kinds)), layout="constrained")
         panels = figure.subplots(len(kinds), squeeze=False)[:, 0]
         for axes, names in zip(panels, kinds.values(), strict=True):
@@ -103,6 +99,14 @@ def plot_sweep(
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
     return figure
+
+
+def _by_kind(outputs: Sequence[str]) -> dict[str, list[str]]:
+    """Outputs by what they are, such as ``C0`` or ``dC``."""
+    kinds: dict[str, list[str]] = {}
+    for output in outputs:
+        kinds.setdefault(output.partition("_")[0], []).append(output)
+    return kinds
 
 
 def _lines(

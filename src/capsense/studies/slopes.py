@@ -16,8 +16,6 @@ from capsense.errors import DesignError, ScenarioError
 from capsense.studies.capacitances import (
     Capacitances,
     is_code,
-    load_design_template,
-    load_scenario_template,
 )
 from capsense.studies.points import WRONG_POINT, Evaluation
 from capsense.studies.template import Point
@@ -68,8 +66,7 @@ def derivatives(
         ScenarioError: The scenario or a step is wrong.
         CapSenseError: Nothing can be made of the point, or a step from it.
     """
-    bodies = None if scenario is None else load_scenario_template(scenario)
-    evaluation = Capacitances.of(load_design_template(design), [point], bodies)
+    evaluation = Capacitances.load(design, [point], scenario)
     if steps is None:
         steps = {name: None for name, value in point.items() if not isinstance(value, str)}
     WithDerivatives.of(evaluation, steps, [point])  # checks the steps

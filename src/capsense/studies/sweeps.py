@@ -12,12 +12,7 @@ import numpy as np
 
 from capsense._validate import UNITS
 from capsense.errors import ScenarioError
-from capsense.studies.capacitances import (
-    Capacitances,
-    load_design_template,
-    load_readout_template,
-    load_scenario_template,
-)
+from capsense.studies.capacitances import Capacitances
 from capsense.studies.points import Evaluation, StudyRow, fill_table, jobs_within
 from capsense.studies.slopes import WithDerivatives
 from capsense.studies.template import Point, Value
@@ -70,12 +65,7 @@ def sweep(
         ValueError: There are no points, or too many.
     """
     points = grid(vary)
-    evaluation = Capacitances.of(
-        load_design_template(design),
-        points,
-        None if scenario is None else load_scenario_template(scenario),
-        None if readout is None else load_readout_template(readout),
-    )
+    evaluation = Capacitances.load(design, points, scenario, readout)
     jobs = jobs or jobs_within(evaluation.cost(points).memory)
     return fill_table(
         points, with_derivatives(evaluation, derivatives, points), Path(output), jobs=jobs,
