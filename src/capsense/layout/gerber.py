@@ -13,7 +13,10 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
+import numpy as np
 import shapely
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
@@ -162,14 +165,7 @@ class _SetReader:
     ) -> list[tuple[str, str, BaseGeometry]]:
         """Islands with the name of their net; those that plated holes join share it."""
         tree = shapely.STRtree([shape for _, shape, _ in rows])
-        group = list(range(len(rows)))
-
-        def root(k: int) -> int:
-            while group[k] != k:
-                group[k] = group[group[k]]
-                k = group[k]
-            return k
-
+        links: list[tuple[int, int]] = []
         files = self.of_kind("drill")
         if not files and len(names) > 1:
             self.notes.append("The set has no drill file: layers of one net are not joined.")
@@ -188,11 +184,12 @@ class _SetReader:
             for hole in holes:
                 hits = [int(k) for k in tree.query(hole, predicate="intersects")]
                 hits = [k for k in hits if rows[k][0] in joins]
-                for k in hits[1:]:
-                    group[root(k)] = root(hits[0])
+                links += [(hits[0], k) for k in hits[1:]]
+        row, column = np.array(links, dtype=int).reshape(-1, 2).T
+        graph = coo_matrix((np.ones(len(links)), (row, column)), shape=(len(rows), len(rows)))
         members: dict[int, list[int]] = {}
-        for k in range(len(rows)):
-            members.setdefault(root(k), []).append(k)
+        for k, label in enumerate(connected_components(graph, directed=False)[1].tolist()):
+            members.setdefault(label, []).append(k)
         ordered = sorted(members.values(), key=lambda m: -sum(rows[k][1].area for k in m))
         out = []
         for number, ks in enumerate(ordered, start=1):
