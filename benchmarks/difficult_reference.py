@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from bem_reference import FARADS, Panels, box_panels, face, spread
+from bem_reference import Panels, box_panels, face, spread
 from near_integrals import fluxes, potentials
-from near_reference import Feature, Layout, sensor_panels, stops
+from near_reference import Feature, Layout, induced, sensor_panels, stops
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -372,14 +372,8 @@ def change(sensor: Panels, owner: Array, eps: Array, body: Panels, whose: Array,
     potential = phi.copy()
     if len(faces):
         potential[faces] = potentials(Panels(body.corners[faces]), sensor) @ answer[:, n:]
-    whole = np.zeros((n + len(free), n + len(free)))
-    whole[:n, :n] = own - rows @ answer[:, :n]
-    for t, k in enumerate(free):
-        mine = np.flatnonzero(number == k)
-        whole[n + t, mine] = whole[mine, n + t] = body.area[mine]
-    given = np.concatenate([phi, np.zeros((len(free), phi.shape[1]))])
-    delta = FARADS * potential.T @ np.linalg.solve(whole, given)[:n]
-    return (delta + delta.T) / 2
+    areas = [body.area * (number == k) for k in free]
+    return induced(own - rows @ answer[:, :n], phi, potential, areas)
 
 
 def square(panels: Panels, given: NDArray[np.bool_]) -> Array:

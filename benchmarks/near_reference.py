@@ -453,13 +453,26 @@ def change(sensor: Panels, owner: Array, eps: Array, body: Panels, whose: Array,
     n = len(body)
     phi = across @ answer[:, n:]
     free = np.flatnonzero(floating)
-    whole = np.zeros((n + len(free), n + len(free)))
-    whole[:n, :n] = potentials(body, body) - across @ answer[:, :n]
-    for t, k in enumerate(free):
-        mine = np.flatnonzero(whose == k)
-        whole[n + t, mine] = whole[mine, n + t] = body.area[mine]
-    given = np.concatenate([phi, np.zeros((len(free), phi.shape[1]))])
-    delta = FARADS * phi.T @ np.linalg.solve(whole, given)[:n]
+    matrix = potentials(body, body) - across @ answer[:, :n]
+    return induced(matrix, phi, phi, [body.area * (whose == k) for k in free])
+
+
+def induced(matrix: Array, phi: Array, potential: Array, free: list[Array]) -> Array:
+    """ΔC [F] by the charges on n panels of bodies, of which some conductors float.
+
+    Args:
+        matrix: What the panels meet of each other, shape (n, n).
+        phi: What they meet with each of t terminals at 1 V, shape (n, t).
+        potential: The potential there, shape (n, t).
+        free: For each floating conductor the areas of its panels, 0 for others, shape (n,).
+    """
+    n, count = len(matrix), len(free)
+    whole = np.zeros((n + count, n + count))
+    whole[:n, :n] = matrix
+    for t, areas in enumerate(free, start=n):
+        whole[t, :n] = whole[:n, t] = areas
+    given = np.concatenate([phi, np.zeros((count, phi.shape[1]))])
+    delta = FARADS * potential.T @ np.linalg.solve(whole, given)[:n]
     return (delta + delta.T) / 2
 
 
