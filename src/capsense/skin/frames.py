@@ -20,16 +20,16 @@ class _Joint(NamedTuple):
     """Of the child in the frame of the parent, where the joint is at zero."""
 
 
-def read_frames(path: Path, pattern: str) -> tuple[str, dict[str, Pose]]:
-    """Links of a URDF file with a name of a pattern, and the link that they are fixed to.
+def read_frames(path: Path, pattern: str) -> dict[str, Pose]:
+    """Links of a URDF file with a name of a pattern, which one link carries by fixed joints.
 
     Args:
         path: The file.
         pattern: Such as ``"l_forearm_skin_*"``.
 
     Returns:
-        Name of the link that carries them: the first one that a joint moves, or the root; and their
-        poses in its frame, in the order of the file.
+        Their poses in the frame of the link that carries them, the first one above them that a
+        joint moves, or the root; in the order of the file.
 
     Raises:
         SceneError: The file cannot be read, no link has such a name, or they move against each
@@ -54,7 +54,7 @@ def read_frames(path: Path, pattern: str) -> tuple[str, dict[str, Pose]]:
             f"{path}: {first!r} is fixed to {one!r}, but {second!r} to {two!r}; give a pattern of "
             "frames that one link carries"
         )
-    return next(iter(carriers)), found
+    return found
 
 
 def _read(path: Path) -> tuple[dict[str, _Joint], list[str]]:

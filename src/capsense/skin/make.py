@@ -437,10 +437,9 @@ def _matrix(rotation: Array, point: Array) -> Array:
 
 
 def _from_frames(path: Path, pattern: str) -> Taxels:
-    _, poses = read_frames(path, pattern)
     rows = [
         (f"{path}, link {name!r}", name, [*pose.position, *pose.rotation[:, 2]])
-        for name, pose in poses.items()
+        for name, pose in read_frames(path, pattern).items()
     ]
     return checked_taxels(rows, 1.0, str(path))
 
