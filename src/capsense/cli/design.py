@@ -102,7 +102,7 @@ def _refined(design: Design, tolerance: float, *, quiet: bool) -> int:
             say(stage)
 
     found = refine(design, tolerance, tell)
-    names, own = design.electrode_names, float(design.build.get("resolution", 1.0))
+    names, own = design.electrode_names, design.resolution
     worst = f"{100 * found.errors.max():.2g} %"
     print()
     print(

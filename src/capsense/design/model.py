@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._validate import as_number, shorten
+from capsense.constants import LARGEST_TIE
 from capsense.cover import GROUND as COVER_GROUND
 from capsense.cover import Cover
 from capsense.design.film import Film
@@ -39,8 +40,6 @@ RESOLUTIONS = 0.25, 4.0
 """The smallest and the largest ``[build] resolution``."""
 _INFINITY = 1e5
 """How many box sizes below an open domain its ground lies."""
-_LARGEST_TIE = 1e-3
-"""Capacitances to earth beyond this [F] are slips of the pen."""
 _SIGHT = 10.0
 """How many box sizes beyond an open domain bodies still count."""
 
@@ -198,11 +197,11 @@ class Design:
         tie = 0.0
         if not (isinstance(grounding, str) and grounding == "floating"):
             tie = as_number(grounding)
-            if not 0.0 < tie <= _LARGEST_TIE:
+            if not 0.0 < tie <= LARGEST_TIE:
                 raise DesignError(
                     f'grounding = {shorten(grounding)}; give "grounded", "floating", or the '
                     "capacitance from the local ground to earth in farads, like 100e-12, up to "
-                    f"{_LARGEST_TIE:g}"
+                    f"{LARGEST_TIE:g}"
                 )
         if LOCAL_GROUND in (sheet.name for sheet in self.sheets):
             raise DesignError(
@@ -288,6 +287,11 @@ class Design:
     def sheets(self) -> tuple[Electrode | Conductor, ...]:
         """Everything that conducts: the electrodes, then the other conductors."""
         return (*self.electrodes, *self.conductors)
+
+    @property
+    def resolution(self) -> float:
+        """How much finer than by default it asks to be built, its ``[build] resolution``."""
+        return float(self.build.get("resolution", 1.0))
 
     @property
     def electrode_names(self) -> tuple[str, ...]:

@@ -234,7 +234,7 @@ def shipped_dir() -> Traversable:
 
 def default_settings(design: Design) -> BuildSettings:
     """Settings that a design's ``[build]`` table asks for."""
-    return BuildSettings().refined(float(design.build.get("resolution", 1.0)))
+    return BuildSettings().refined(design.resolution)
 
 
 def load_or_build(
@@ -275,26 +275,23 @@ def load_or_build(
 
 def is_at_hand(key: str) -> bool:
     """Whether the field of a key comes with the package, or is in the user's cache."""
-    shipped = shipped_dir()
-    names = [file.name for file in shipped.iterdir()] if shipped.is_dir() else []
-    return (
-        any(n.endswith(f"-{key}.npz") for n in names)
-        or (default_cache_dir() / f"{key}.npz").is_file()
-    )
+    return bool(_shipped(key, shipped_dir())) or (default_cache_dir() / f"{key}.npz").is_file()
+
+
+def _shipped(key: str, folder: Traversable) -> list[Traversable]:
+    """The files of a key among those that come with the package."""
+    if not folder.is_dir():
+        return []
+    return [file for file in folder.iterdir() if file.name.endswith(f"-{key}.npz")]
 
 
 def load_shipped(key: str, folder: Traversable | None = None) -> BackgroundField | None:
     """Return the field that comes with the package for a key, if there is one."""
-    folder = folder or shipped_dir()
-    if folder.is_dir():
-        for file in folder.iterdir():
-            if file.name.endswith(f"-{key}.npz"):
-                try:
-                    return to_background(
-                        *parse_arrays(file.read_bytes(), str(file), kind="field", key=key)
-                    )
-                except (FieldError, OSError) as error:
-                    _log.warning("a field that came with the package is not used: %s", error)
+    for file in _shipped(key, folder or shipped_dir()):
+        try:
+            return to_background(*parse_arrays(file.read_bytes(), str(file), kind="field", key=key))
+        except (FieldError, OSError) as error:
+            _log.warning("a field that came with the package is not used: %s", error)
     return None
 
 

@@ -63,7 +63,7 @@ def refine(
     """
     if not 0.0 < tolerance < 1.0:
         raise DesignError(f"tolerance is {tolerance:g}; give a number above 0 and below 1")
-    own = float(design.build.get("resolution", 1.0))
+    own = design.resolution
     found: Refinement | None = None
     resolution = own / _STEP
     while resolution <= RESOLUTIONS[1]:

@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Any, Literal, cast, get_args
 
 from capsense._validate import as_number, nearest, shorten, suggest
-from capsense.constants import EPS0
+from capsense.constants import EPS0, LARGEST_TIE
 from capsense.errors import SceneError
 from capsense.scene.pose import as_float
 
@@ -281,10 +281,6 @@ GROUND_PATHS: Mapping[str, GroundPath] = MappingProxyType(
 """Models of a person's path to ground, by name."""
 
 
-_LARGEST = 1e-3
-"""Capacitances to ground beyond this [F] are slips of the pen."""
-
-
 @dataclass(frozen=True)
 class Ties:
     """What ties a conductor to earth and to the local ground of the sensor.
@@ -303,11 +299,11 @@ class Ties:
     holds it."""
 
     def __post_init__(self) -> None:
-        for name, most in (("earth", _LARGEST), ("local", math.inf)):
+        for name, most in (("earth", LARGEST_TIE), ("local", math.inf)):
             value = as_number(getattr(self, name))
-            if not (0.0 <= value <= _LARGEST or value == most):
+            if not (0.0 <= value <= LARGEST_TIE or value == most):
                 raise SceneError(
-                    f"ties: {name} is {getattr(self, name)!r} F; give 0 to {_LARGEST:g} F"
+                    f"ties: {name} is {getattr(self, name)!r} F; give 0 to {LARGEST_TIE:g} F"
                     + (", or math.inf" if most == math.inf else "")
                 )
         if self.earth == self.local == 0.0:
@@ -322,15 +318,14 @@ _Tie = Literal["grounded", "floating", "local"]
 Grounding = _Tie | float | Ties
 
 
-def ties_of(grounding: Grounding) -> Ties:
-    """A grounding as capacitances [F]: infinite to earth for ``"grounded"``; 0 for none."""
+def ties_of(grounding: Grounding) -> tuple[float, float]:
+    """Capacitances of a grounding to earth and to the local ground [F], 0 for none."""
     if isinstance(grounding, Ties):
-        return grounding
-    out = object.__new__(Ties)
-    known = {"grounded": math.inf, "floating": 0.0, "local": 0.0}
-    earth = known[grounding] if isinstance(grounding, str) else grounding
-    out.__dict__.update(earth=earth, local=math.inf if grounding == "local" else 0.0)
-    return out
+        return grounding.earth, grounding.local
+    if isinstance(grounding, float):
+        return grounding, 0.0
+    words = {"grounded": (math.inf, 0.0), "floating": (0.0, 0.0), "local": (0.0, math.inf)}
+    return words[grounding]
 
 
 def checked_grounding(grounding: object) -> Grounding:
@@ -356,9 +351,9 @@ def checked_grounding(grounding: object) -> Grounding:
         raise SceneError(
             f"grounding is {shorten(grounding)}, not a positive finite capacitance; {fix}"
         )
-    if farads > _LARGEST:
+    if farads > LARGEST_TIE:
         raise SceneError(
-            f"grounding is {farads:g} F, more than {_LARGEST:g} F; the capacitance to ground is in "
-            f'farads; did you mean {farads * 1e-12:g}? A body of a large one is "grounded"'
+            f"grounding is {farads:g} F, more than {LARGEST_TIE:g} F; the capacitance to ground is "
+            f'in farads; did you mean {farads * 1e-12:g}? A body of a large one is "grounded"'
         )
     return farads

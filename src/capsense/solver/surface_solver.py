@@ -360,7 +360,7 @@ class SurfaceSolver:
         """What bodies are made of, with lengths as kernels take them."""
         local = self.green.local >= 0
         matter = matter_of(bodies, self.excitation_frequency, self.length, local=local)
-        if self._groundless and any(ties_of(body.grounding).local > 0.0 for body in bodies):
+        if self._groundless and any(ties_of(body.grounding)[1] > 0.0 for body in bodies):
             raise SceneError(
                 "a body is tied to the local ground, which floats and has no conductor; give the "
                 'design a [[conductor]] of role = "ground", or the body another grounding'

@@ -205,8 +205,8 @@ def _matter(
 ) -> Matter:
     eps = np.array([material.complex_permittivity(frequency) for material, _ in bodies], complex)
     eps[np.abs(eps) >= CONDUCTING] = np.inf
-    ties = [ties_of(grounding) for _, grounding in bodies]
-    earth, own = (np.array([getattr(t, n) for t in ties], float) / unit for n in ("earth", "local"))
+    ties = np.array([ties_of(grounding) for _, grounding in bodies], float).reshape(-1, 2)
+    earth, own = ties.T / unit
     alone = np.arange(len(bodies))
     if local and own.any():
         return Matter(eps, earth, alone, unit, own)
