@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import warnings
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
+from capsense.field.green_points import narrowest_width
 from capsense.fleet.bodies import (
     WORLD,
     BodyTable,
@@ -36,7 +37,6 @@ from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body
 from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator, checked_preset
 from capsense.solver.surface_solver import PRESETS, SurfaceSolver
-from capsense.solver.tree.fine_panels import WIDE
 
 if TYPE_CHECKING:
     from capsense.fleet.warp_chips import WarpChips
@@ -45,7 +45,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _PANELS = 5
-"""Panels of a shape for each cluster that a body is cut into on Warp."""
+"""Panels of a shape for each cluster that a body is cut into on Warp …"""
+_WIDTHS = 0.5
+"""… and more of them where they would be wider than so much of the narrowest electrode."""
 
 
 class Fleet:
@@ -127,11 +129,12 @@ class Fleet:
         n = self._terminals.electrodes
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
-        self.table = BodyTable(self._solver, count, len(bodies), sensors)
+        width = math.inf if device == "cpu" else _WIDTHS * narrowest_width(self.design)
+        self.table = BodyTable(self._solver, count, len(bodies), sensors, width)
         self.readout: Readout | None = None
         """The readout of which every sensor has a chip, if any."""
         self._chips: Any = None
-        self._one, self._warned = ForkSafeRLock(), False
+        self._one = ForkSafeRLock()
         self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
@@ -185,21 +188,6 @@ class Fleet:
         with self._one:
             self.table.change(place, bodies, environments)
             self._take_over()
-        if self._warp is not None and not self._warned:
-            self._warn_of_wide(place)
-
-    def _warn_of_wide(self, place: int) -> None:
-        for body in {id(b): b for b in self.table.given[:, place] if b is not None}.values():
-            middle = float(np.sort(np.ptp(body.shape.bounds(), axis=0))[1])
-            if middle > WIDE:
-                self._warned = True
-                warnings.warn(
-                    f"place {place}: {middle:.2g} m is wide for a body on Warp, which is cut into "
-                    "few clusters: near the sensor readings are tens of per cent off. Compare with "
-                    'fleet.check(poses), or take device="cpu". Further warnings are suppressed',
-                    stacklevel=3,
-                )
-                return
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """Leave places out of what a sensor sees, such as the link that carries it.

@@ -44,7 +44,8 @@ class Shapes:
 
     first: wp.array(dtype=wp.int32)  # first cluster of a shape
     functions: wp.array(dtype=wp.int32)  # how many functions have energies
-    block: wp.array(dtype=wp.int64)  # where its energies begin
+    block: wp.array(dtype=wp.int64)  # where its energies begin …
+    inside: wp.array(dtype=wp.int64)  # … and its impedances, if it is a dielectric's
     radius: wp.array(dtype=wp.float32)
     children: wp.array2d(dtype=wp.int32)  # parts of a cluster, from 0 within the shape; -1 for none
     function: wp.array(dtype=wp.int32)
@@ -163,9 +164,11 @@ def _unit(pose: wp.transform):
 def _need(
     shapes: Shapes, green: Response, at: wp.transform, scale: float, first: int, node: int
 ):  # fmt: skip
-    """Extent of a cluster over its distance from the design; 0 for a single panel.
+    """What splitting a cluster is worth, roughly; 0 for a single panel.
 
-    Where it crosses a wall, ``_CROSSING`` times its share of the body's length is added.
+    In the field of a charge at a distance d, the function of a cluster of extent s has an energy
+    like s³/d⁴; its fourth root is taken, over that of s⁻¹ for the whole body. Where a cluster
+    crosses a wall, ``_CROSSING`` times its share of the body's length is added.
     """
     if shapes.children[node, 0] < 0:
         return float(0.0)
@@ -178,7 +181,8 @@ def _need(
     crossing = smooth(2.0 - 4.0 * wp.abs(room) / (size + 1e-9))
     crossing = crossing * smooth((size / green.extent - _LONG0) / (_LONG1 - _LONG0))
     crossing = crossing * shapes.extent[node] / shapes.extent[first]
-    return size / (wp.max(away, _HALF * size) + _NEAREST) + _CROSSING * crossing
+    smaller = wp.sqrt(wp.sqrt(shapes.extent[first] / shapes.extent[node]))
+    return smaller * size / (wp.max(away, _HALF * size) + _NEAREST) + _CROSSING * crossing
 
 
 @wp.func
