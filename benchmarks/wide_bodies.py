@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import tomllib
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -174,11 +173,9 @@ def deltas(
     """ΔC of scenes of equally many bodies, what the fleet says of its error, and the largest entry
     of the empty sensor's matrix [F]."""
     places = len(scenes[0].bodies)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        fleet = cs.Fleet(design, scenes[0].bodies, len(scenes), **options)
-        for place in range(places):
-            fleet.change(place, [scene.bodies[place] for scene in scenes])
+    fleet = cs.Fleet(design, scenes[0].bodies, len(scenes), **options)
+    for place in range(places):
+        fleet.change(place, [scene.bodies[place] for scene in scenes])
     if places > 1:
         fleet.join(list(range(places)))
     reading = fleet.step(np.array([scene.poses for scene in scenes]))

@@ -6,7 +6,6 @@ import copy
 import importlib
 import pickle
 import re
-import warnings
 
 import numpy as np
 import pytest
@@ -392,17 +391,32 @@ def test_a_captured_step_reads_nan_after_a_new_shape() -> None:
     np.testing.assert_array_equal(reading.delta.numpy(), truth)
 
 
-def test_wide_bodies_are_warned_of_once() -> None:
-    """A warning names the place and the fix; on the CPU, which knows wide bodies, there is none."""
-    table = cs.Body(cs.Box((0.5, 0.4, 0.02)))
-    with pytest.warns(UserWarning, match=r'place 1: 0.4 m is wide .*take device="cpu"') as told:
-        fleet = cs.Fleet("six_patch", [BODIES[0], table], 1, device="warp:cpu", budget=32)
-    assert len(told) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        fleet.change(0, table)
-        cs.Fleet("six_patch", [table], 1)
-        cs.Fleet("six_patch", [cs.Body(cs.Capsule(0.04, 0.4))], 1, device="warp:cpu", budget=32)
+def test_wide_bodies_are_near_the_fine_preset() -> None:
+    """Differential: a plate, a trunk and a table face on, at 30 and 60 mm; 5 % of the largest."""
+    shapes = [cs.Box((0.5, 0.5, 0.02)), cs.Cylinder(0.15, 0.5), cs.Box((0.9, 0.6, 0.03))]
+    gaps = (0.03, 0.06)
+    bodies = [cs.Body(shape) for shape in shapes for _ in gaps]
+    where = np.zeros((len(bodies), 1, 7))
+    where[..., 6] = 1.0
+    where[:, 0, 2] = [np.ptp(s.bounds(), axis=0)[2] / 2 + gap for s in shapes for gap in gaps]
+    found = []
+    for options in ({"device": "warp:cpu", "budget": 128}, {"preset": "fine"}):
+        fleet = cs.Fleet("six_patch", bodies[:1], len(bodies), **options)
+        fleet.change(0, bodies)
+        delta = fleet.step(where).delta
+        found.append((delta if isinstance(delta, np.ndarray) else delta.numpy()).astype(float))
+    off = np.abs(found[0] - found[1]).max(axis=(1, 2, 3)) / np.abs(found[1]).max(axis=(1, 2, 3))
+    assert off.max() < 0.05
+
+
+def test_panels_of_wide_bodies_are_more() -> None:
+    """Unit: four times as many for a table, as usual for a finger; and energies of all of them."""
+    table, finger = cs.Body(cs.Box((0.5, 0.4, 0.02))), cs.Body(cs.Capsule(0.008, 0.06))
+    usual, wide = (
+        cs.Fleet("six_patch", [body], 1, device="warp:cpu", budget=32).table.shapes[0].panels
+        for body in (finger, table)
+    )
+    assert 3 * len(usual) < len(wide) < 6 * len(usual)
 
 
 @pytest.mark.parametrize("make", [copy.deepcopy, pickle.dumps])
