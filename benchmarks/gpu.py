@@ -159,9 +159,7 @@ def work(fleet: cs.Fleet) -> dict[str, tuple[float, float]]:
     return {name: (float(f.sum()), 4.0 * float(b.sum())) for name, (f, b) in count.items()}
 
 
-def kernels(
-    clock: Clock, count: int, budget: int, peak: dict[str, float]
-) -> list[dict[str, Any]]:
+def kernels(clock: Clock, count: int, budget: int, peak: dict[str, float]) -> list[dict[str, Any]]:
     """Times of the kernels of a step [s], and the least that the device would take."""
     fleet, poses = finger_fleet(clock, count, budget)
     core, spent = fleet._warp, {}
@@ -305,7 +303,7 @@ def table(found: dict[str, Any]) -> str:
         f"{peak['flops'] / 1e12:.3g} TFLOP/s in single precision, {peak['bytes'] / 1e9:.3g} GB/s.",
         "",
         "| budget | environments | solves a second | step | with derivatives | memory of a sensor | "
-        "rms, worst difference to `\"fine\"` |",
+        'rms, worst difference to `"fine"` |',
         "|---|---|---|---|---|---|---|",
     ]
     off = {row["budget"]: row for row in found["errors"]}

@@ -226,4 +226,8 @@ def twin_of(fleet: cs.Fleet) -> cs.Simulator:
     simulator._solver.green = green._replace(
         levels=(near, far, far), blends=np.array([start, start + 1.0])
     )
+    usual = simulator._solver.functions_of
+    simulator._solver.functions_of = lambda shape, conducting, share=1.0: usual(
+        shape, conducting, share * fleet.table.share(shape)
+    )
     return simulator

@@ -16,6 +16,7 @@ from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import windowed
 from capsense.solver.surface_solver import SurfaceSolver
 from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.fine_panels import WIDE
 from capsense.solver.tree.matter import matter_of
 from capsense.solver.tree.rigid import BODY, RigidShape
 
@@ -198,7 +199,7 @@ class BodyTable:
         whole = body.shape.measured_in(length)
         window, _ = windowed(whole, np.zeros(3), self._solver.reach)
         shape, size = self._solver.functions_of(
-            window, bool(matter.conducting[0]), self._share(window)
+            window, bool(matter.conducting[0]), self.share(window)
         )
         tie = complex(matter.ties(np.array([size * shape.capacitance]))[0])
         neutral = int(np.isinf(tie.real))
@@ -207,12 +208,14 @@ class BodyTable:
         cut = 0.5 * np.ptp(whole.bounds(), axis=0) - 0.5 * np.ptp(window.bounds(), axis=0)
         return number, size, soft, 0.0 if neutral else tie, neutral, cut
 
-    def _share(self, shape: Shape) -> float:
-        """How many times the usual panels a shape has, whose lengths are over ``length``.
+    def share(self, shape: Shape) -> float:
+        """How many times the usual panels a wide shape has, whose lengths are over ``length``.
 
         Of clusters that are few, those in front of the design can be small only if panels are.
         """
         low, middle, high = np.ptp(shape.bounds(), axis=0).tolist()
+        if sorted((low, middle, high))[1] * self._solver.length <= WIDE:
+            return 1.0
         area = 2.0 * (low * middle + middle * high + high * low)
         more = area / self._width**2 / self._solver.preset.panels
         more = math.ceil(math.log2(max(more, 1.0)))

@@ -17,6 +17,7 @@ from capsense.fleet.warp_cut import (
     four,
     idle,
     lift_back,
+    off_box,
     row,
     smooth,
 )
@@ -229,7 +230,7 @@ def bound_walls(
     green: Response, cut: WarpActiveTree, rows: wp.array3d(dtype=wp.float32),
     pairs: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Let no cluster at a wall meet its images there more than itself.
+    """Let no cluster that is nearer to a wall than to the design meet its images more than itself.
 
     Points of large ones may lie among the sources that stand for the wall; no definite matrix would
     be left. They come to be out of reach instead, as those beyond the wall are.
@@ -241,7 +242,8 @@ def bound_walls(
     low = center - green.room0
     high = green.room1 - center
     room = wp.min(wp.min(wp.min(low[0], low[1]), low[2]), wp.min(wp.min(high[0], high[1]), high[2]))
-    if room > cut.extent[i, v]:
+    away = wp.length(off_box(center, green.box0, green.box1))
+    if room > wp.min(away, cut.extent[i, v]):
         return
     met = float(0.0)
     for k in range(green.first, cut.width[v]):
