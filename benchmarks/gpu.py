@@ -11,8 +11,8 @@ not fit into the device's memory are left out; the result names them.
 - rates: median step, with and without derivatives, and memory that a sensor takes.
 - simulator: a forearm that falls past one sensor in MuJoCo Warp; the sensor's reading over the
   physics' step and the reading together.
-- errors: entries of ΔC in scenes of the reference map beside ``Simulator(preset="fine")``, over each
-  scene's largest.
+- errors: entries of ΔC in scenes of the reference map beside ``Simulator(preset="fine")``, over the
+  largest of each scene.
 - kernels: time of each kernel of a step, which waits for each here; and of the largest ones, how
   long the device would take at its peak for the floating-point operations and for the bytes of
   :func:`work`, whichever is longer. Peaks are measured: multiply-adds in registers, and copies.
@@ -302,7 +302,7 @@ def table(found: dict[str, Any]) -> str:
         f"Warp {found['machine']['versions'].get('warp-lang', 'unknown')}; peaks measured: "
         f"{peak['flops'] / 1e12:.3g} TFLOP/s in single precision, {peak['bytes'] / 1e9:.3g} GB/s.",
         "",
-        "| budget | environments | solves a second | step | with derivatives | memory of a sensor | "
+        "| budget | environments | solves a second | step | with derivatives | memory | "
         'rms, worst difference to `"fine"` |',
         "|---|---|---|---|---|---|---|",
     ]

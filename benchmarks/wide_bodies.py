@@ -5,8 +5,9 @@
 
 Scenes are drawn at random: a table, a wall, a trunk or a person of ten capsules that are joined, of
 random sizes and matter, whose lowest point within 0.2 m of the design's axis is 15 to 150 mm above
-its top (even in the logarithm), half of them face on to 15 degrees, half turned in any way. Designs are grids of random
-pads, but for the first one of each half. The half ``held`` was not looked at before all was done.
+its top (even in the logarithm), half of them face on to 15 degrees, half turned in any way. Designs
+are grids of random pads, but for the first one of each half. Nothing was chosen by the scenes of
+the half ``held``.
 The error of a scene is the largest difference of an entry of ΔC over the largest entry of the
 CPU's. Scenes count where that is above a thousandth of the largest entry of the empty sensor's.
 """
