@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +38,7 @@ from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body
 from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator, checked_preset
 from capsense.solver.surface_solver import PRESETS, SurfaceSolver
+from capsense.solver.tree.fine_panels import WIDE
 
 if TYPE_CHECKING:
     from capsense.fleet.warp_chips import WarpChips
@@ -134,7 +136,7 @@ class Fleet:
         self.readout: Readout | None = None
         """The readout of which every sensor has a chip, if any."""
         self._chips: Any = None
-        self._one = ForkSafeRLock()
+        self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
@@ -188,6 +190,22 @@ class Fleet:
         with self._one:
             self.table.change(place, bodies, environments)
             self._take_over()
+        if self._warp is not None and not self._warned:
+            self._warn_of_wide(place)
+
+    def _warn_of_wide(self, place: int) -> None:
+        for body in {id(b): b for b in self.table.given[:, place] if b is not None}.values():
+            middle = float(np.sort(np.ptp(body.shape.bounds(), axis=0))[1])
+            if middle > WIDE:
+                self._warned = True
+                warnings.warn(
+                    f"place {place}: {middle:.2g} m is wide for a body on Warp, which is cut into "
+                    "few clusters: readings are some per cent off, within 15 mm and of thin "
+                    "dielectrics tens of per cent. Compare with fleet.check(poses), or take "
+                    'device="cpu". Further warnings are suppressed',
+                    stacklevel=3,
+                )
+                return
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """Leave places out of what a sensor sees, such as the link that carries it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import pickle
+import warnings
 import re
 
 import numpy as np
@@ -417,6 +418,19 @@ def test_panels_of_wide_bodies_are_more() -> None:
         for body in (finger, table)
     )
     assert 3 * len(usual) < len(wide) < 6 * len(usual)
+
+
+def test_wide_bodies_are_warned_of_once() -> None:
+    """A warning names the place and the fix; on the CPU, which knows wide bodies, there is none."""
+    table = cs.Body(cs.Box((0.5, 0.4, 0.02)))
+    with pytest.warns(UserWarning, match=r'place 1: 0.4 m is wide .*take device="cpu"') as told:
+        fleet = cs.Fleet("six_patch", [BODIES[0], table], 1, device="warp:cpu", budget=32)
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fleet.change(0, table)
+        cs.Fleet("six_patch", [table], 1)
+        cs.Fleet("six_patch", [cs.Body(cs.Capsule(0.04, 0.4))], 1, device="warp:cpu", budget=32)
 
 
 @pytest.mark.parametrize("make", [copy.deepcopy, pickle.dumps])
