@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import importlib
 import pickle
-import warnings
 import re
+import warnings
 
 import numpy as np
 import pytest
