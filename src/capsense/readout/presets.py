@@ -244,8 +244,8 @@ def chip_of(name: str) -> Chip:
     key = str(name).strip().lower() if isinstance(name, str | Path) else ""
     if key.endswith(".toml"):
         raise ReadoutError(
-            f"{str(name)!r} is a readout file; load_readout({str(name)!r}, electrodes, …) takes it, "
-            "with the same options"
+            f"{str(name)!r} is a readout file; load_readout({str(name)!r}, electrodes, …) takes "
+            "it, with the same options"
         )
     if key not in CHIPS:
         raise ReadoutError(f"unknown chip {name!r}; {suggest(str(name), CHIPS)}")
