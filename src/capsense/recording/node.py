@@ -453,7 +453,8 @@ def convert(
             _play(sensors, bag, topics, file, rate, sim_time, stopped)
         finally:
             file.close()
-    if not sensors.count:
+    if not sensors.count and not stopped():
+        target.unlink()
         raise RecordingError(f"nothing could be read: {sensors.problems}")
     return sensors.count
 
