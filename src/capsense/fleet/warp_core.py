@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -396,9 +396,9 @@ class WarpCore:
             warp_fabric.add_slopes, size, self.circuit, fabric, self.cut.moved, found, volts, out
         )
 
-    def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
+    def chips(self, readout: Readout, empty: Array, how: Mapping[str, Any]) -> WarpChips:
         """Chips for all sensors, see :class:`WarpChips`."""
-        return WarpChips(readout, (self.counts[0], self.counts[2]), empty, seed, self.device)
+        return WarpChips(readout, self.counts[0], self.counts[2], empty, self.device, **how)
 
     def launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:
         """Launch a kernel on the device."""
