@@ -102,10 +102,12 @@ def test_a_recording_is_felt_again(
         assert [t for t, _ in got] == [round(s.time * S) for s in steps]
         for (_, message), step in zip(got, steps, strict=True):
             assert message.data.tobytes() == getattr(step.reading, name).tobytes()
-    assert found["/tf"][3][1] == bag_of(one)["/tf"][3][1]
+    assert ros.encode(found["/tf"][3][1]) == ros.encode(bag_of(one)["/tf"][3][1])
     cloud = found["/sensor/points"][-1][1]
     assert cloud.header.frame_id == "sensor"
-    assert (cloud.header.stamp.sec, cloud.header.stamp.nanosec) == divmod(round(steps[-1].time * S), S)
+    assert (cloud.header.stamp.sec, cloud.header.stamp.nanosec) == divmod(
+        round(steps[-1].time * S), S
+    )
     points = points_of(cloud)
     assert points["change"].tolist() == np.diag(steps[-1].reading.delta).tolist()
     assert points["x"].sum() < 1e-6  # the electrodes lie around the middle
@@ -246,7 +248,7 @@ def test_domain_of_the_environment(
 
 
 PEER = """
-import sys, time
+import json, sys, time
 from dataclasses import dataclass
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
@@ -366,7 +368,7 @@ while len(found) < 4 and time.monotonic() < begun + 150:
             found[name] = sample
     time.sleep(0.02)
 cloud = found["points"]
-print(repr(dict(
+print(json.dumps(dict(
     delta=list(found["delta"].data), labels=[d.label for d in found["delta"].layout.dim],
     counts=list(found["counts"].data), about=found["about"].data,
     frame=cloud.header.frame_id, stamp=cloud.header.stamp.sec, width=cloud.width,
@@ -400,7 +402,7 @@ def test_live(file: Path, clock: str) -> None:
         node.kill()
         node.wait()
     assert node.returncode == OK, told
-    found = eval(peer.stdout)  # noqa: S307, it is our own
+    found = json.loads(peer.stdout)
     bodies = load_scenario(file).bodies
     hand = bodies[0].body.moved(cs.Pose((0.01, 0.0, 0.05)))
     table = bodies[1].body.moved(cs.Pose((0.0, 0.0, 0.15)))
@@ -412,5 +414,3 @@ def test_live(file: Path, clock: str) -> None:
     assert json.loads(found["about"])["bodies"] == {"hand": "hand_link", "table": "table"}
     assert -0.2 < found["late"] < 10.0  # the clocks lie years apart
     assert "readings" in told
-
-
