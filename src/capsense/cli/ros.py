@@ -97,9 +97,11 @@ def ros(args: argparse.Namespace) -> int:
     sensors = _sensors(args, scenario)
     if args.bag is not None:
         return _convert(args, scenario, sensors)
+    from capsense.errors import warn_experimental
     from capsense.recording.dds import RosDomain
     from capsense.recording.node import follow
 
+    warn_experimental("publishing to ROS 2", "a peer of CycloneDDS that has its types")
     domain = RosDomain(_domain(args.domain))
     until = math.inf if args.duration is None else time.monotonic() + args.duration
     with Interrupt() as interrupt:
