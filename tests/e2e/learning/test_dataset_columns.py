@@ -13,8 +13,7 @@ from capsense.learning import scenes
 from capsense.learning.draws import PREFIX
 from capsense.learning.scenes import load_spec
 from capsense.learning.shards import run
-from capsense.readout import Readout
-from capsense.readout.presets import expected_of
+from capsense.readout.config import parse_readout
 from capsense.readout.randomisation import FIGURES, ReadoutRandomisation
 from capsense.readout.readout import build
 from capsense.readout.side_by_side import SideBySide
@@ -176,15 +175,11 @@ def test_chips_from_columns(tmp_path: Path) -> None:
     for row in rows_of(spec):
         chips.add(row["chip"])
         seed = row["chip_seed"]
-        options = {
-            "latency": row["drawn.readout.latency"], "seed": seed,
-            "white": row["drawn.readout.noise.white"],
+        content = {
+            "chip": row["chip"], "mode": "self", "latency": row["drawn.readout.latency"],
+            "noise": {"white": row["drawn.readout.noise.white"]}, "seed": seed,
         }  # fmt: skip
-        made = Readout.preset(row["chip"], names, **options)
-        made = Readout.preset(
-            row["chip"], names, **options,
-            expected=expected_of(made.channel_values(simulator.empty)),
-        )  # fmt: skip
+        made = parse_readout(content, names)
         assert made.dac is not None
         bits = made.dac.bits
         errors = np.reshape(row["dac_errors"], (len(names), -1))

@@ -414,3 +414,92 @@ def test_live(file: Path, clock: str) -> None:
     assert json.loads(found["about"])["bodies"] == {"hand": "hand_link", "table": "table"}
     assert -0.2 < found["late"] < 10.0  # the clocks lie years apart
     assert "readings" in told
+
+
+def write_bag(path: Path, kind: str) -> None:
+    """A bag as ``rosbags`` writes it: a still arm, a hand that moves, a clock that began at 100 s.
+
+    Args:
+        path: Where.
+        kind: ``"sqlite"``, ``"mcap"`` or ``"ros1"``.
+    """
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    old = kind == "ros1"
+    store: Any = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
+    if old:
+        text = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+    storage = {"sqlite": "SQLITE3", "mcap": "MCAP"}
+    writer: Any = (
+        rosbag1.Writer(path)
+        if old
+        else rosbag2.Writer(
+            path, version=8, storage_plugin=getattr(rosbag2.StoragePlugin, storage[kind])
+        )
+    )
+    of = store.types
+
+    def transform(parent: str, child: str, stamp: int, x: float, z: float) -> Any:
+        time = of["builtin_interfaces/msg/Time"](*divmod(stamp, S))
+        head = [time, parent]
+        header = of["std_msgs/msg/Header"](*([0, *head] if old else head))
+        place = of["geometry_msgs/msg/Vector3"](x, 0.0, z)
+        turn = of["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        moved = of["geometry_msgs/msg/Transform"](place, turn)
+        return of["geometry_msgs/msg/TransformStamped"](header, child, moved)
+
+    with writer:
+        lines = {
+            topic: writer.add_connection(topic, kind_of, typestore=store)
+            for topic, kind_of in (
+                ("/tf_static", "tf2_msgs/msg/TFMessage"),
+                ("/tf", "tf2_msgs/msg/TFMessage"),
+                ("/clock", "rosgraph_msgs/msg/Clock"),
+            )
+        }
+
+        def put(topic: str, stamp: int, message: Any) -> None:
+            name = message.__msgtype__
+            raw = store.serialize_ros1(message, name) if old else store.serialize_cdr(message, name)
+            writer.write(lines[topic], stamp, raw)
+
+        fixed = [
+            transform("base", "left", 0, 0.0, 0.0), transform("base", "right", 0, 0.2, 0.01),
+            transform("base", "table", 0, 0.0, 0.16),
+        ]  # fmt: skip
+        put("/tf_static", 0, of["tf2_msgs/msg/TFMessage"](fixed))
+        for k in range(11):
+            stamp = k * S // 20
+            clock = of["builtin_interfaces/msg/Time"](*divmod(100 * S + stamp, S))
+            put("/clock", 3 * S + stamp, of["rosgraph_msgs/msg/Clock"](clock))
+            hand = transform("base", "hand", 100 * S + stamp, 0.01 * k, 0.06)
+            put("/tf", 3 * S + stamp + 1, of["tf2_msgs/msg/TFMessage"]([hand]))
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "mcap", "ros1"])
+def test_bags_of_others(tmp_path: Path, file: Path, kind: str) -> None:
+    """Two sensors, fixed frames, a simulator's clock; every kind of bag."""
+    bag, out = tmp_path / ("drive.bag" if kind == "ros1" else "drive"), tmp_path / "felt.mcap"
+    write_bag(bag, kind)
+    command = ["ros", str(file), "--bag", str(bag), "-o", str(out), "--sim-time", "-q"]
+    assert main([*command, "--sensor", "left=left", "--sensor", "right_arm=right"]) == OK
+    found = bag_of(out)
+    left, right = found["/left/delta"], found["/right_arm/delta"]
+    times = [stamp for stamp, _ in left]
+    assert times == [100 * S + k * S // 20 for k in range(11)]
+    simulator = cs.Simulator("patch")
+    hand, table = (b.body for b in load_scenario(file).bodies)
+    for k, ((_, one), (_, other)) in enumerate(zip(left, right, strict=True)):
+        for message, x, z in ((one, 0.0, 0.0), (other, 0.2, 0.01)):
+            bodies = [
+                hand.moved(cs.Pose((0.01 * k - x, 0.0, 0.06 - z))),
+                table.moved(cs.Pose((-x, 0.0, 0.16 - z))),
+            ]
+            expected = simulator.step(cs.Scene(bodies)).delta
+            np.testing.assert_allclose(message.data, expected.ravel(), rtol=1e-9, atol=1e-24)
+    assert set(found) >= {"/tf", "/tf_static", "/diagnostics", "/left/about", "/right_arm/points"}
+    strict = ["--force", "--rate", "40", "--timeout", "0.01", "--sensor", "left=left"]
+    assert main([*command, *strict]) == OK  # in between, the hand's transform is 25 ms old
+    assert [stamp for stamp, _ in bag_of(out)["/left/delta"]] == times
