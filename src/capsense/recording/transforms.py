@@ -28,7 +28,7 @@ class Transform(NamedTuple):
     pose: Pose
 
 
-class Found(NamedTuple):
+class Located(NamedTuple):
     """Where one frame stands in another."""
 
     pose: Pose
@@ -90,7 +90,7 @@ class TransformTree:
         parents = {t.parent for t in self._fixed.values()}
         return sorted(known | parents | {m[-1].parent for m in self._moving.values()})
 
-    def find(self, target: str, source: str) -> Found:
+    def find(self, target: str, source: str) -> Located:
         """The pose of one frame in another, at the last time for which all between is known.
 
         Args:
@@ -117,8 +117,8 @@ class TransformTree:
         stamp = min((known[-1].stamp for known in moving), default=None)
         above, below = (self._product(chain, stamp) for chain in chains)
         if below is None:
-            return Found(above or Pose(), stamp)
-        return Found(below.inverse() @ above if above else below.inverse(), stamp)
+            return Located(above or Pose(), stamp)
+        return Located(below.inverse() @ above if above else below.inverse(), stamp)
 
     def _way(self, frame: str) -> list[Transform]:
         """The newest transforms from a frame up to its root."""
