@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import capsense as cs
 from capsense.learning import scenes
-from capsense.learning.draws import PREFIX
+from capsense.learning.draws import PREFIX, Draw, columns_of
 from capsense.learning.scenes import load_spec
 from capsense.learning.shards import run
 from capsense.readout.config import parse_readout
 from capsense.readout.randomisation import FIGURES, ReadoutRandomisation
 from capsense.readout.readout import build
 from capsense.readout.side_by_side import SideBySide
+from capsense.scenario import ScenarioTable
 from capsense.scene.materials import Ties
 
 pa = pytest.importorskip("pyarrow")
@@ -91,9 +94,8 @@ def random_leaves(value: Any, path: str) -> set[str]:
     if "from" in value:
         return {path}
     if "any" in value:
-        plain = len({type(o) for o in value["any"]} | {dict}) == 2 and not any(
-            isinstance(o, dict) for o in value["any"]
-        )
+        kinds = {"number" if type(o) in (int, float) else type(o) for o in value["any"]}
+        plain = len(kinds) == 1 and kinds <= {"number", str, bool}
         own = {path if plain else f"{path}.any"}
         return own.union(*(random_leaves(o, path) for o in value["any"]))
     out = set().union(*(random_leaves(v, f"{path}.{k}") for k, v in value.items()))
@@ -259,3 +261,39 @@ def test_randomisation_needs_a_chip(tmp_path: Path) -> None:
     without = text[: text.index("[readout]")] + text[text.index("[randomisation]") :]
     with pytest.raises(cs.ScenarioError, match="give a readout, too"):
         spec_of(tmp_path, without)
+
+
+SPANS = st.tuples(st.floats(0.5, 1.0), st.floats(1.0, 2.0)).map(
+    lambda pair: {"from": pair[0], "to": pair[1]}
+)
+PLAIN = st.one_of(st.floats(0, 1), st.sampled_from(["steel", "wood"]), st.booleans(), SPANS)
+VALUES = st.recursive(
+    PLAIN,
+    lambda inner: st.one_of(
+        st.lists(inner, min_size=1, max_size=3),
+        st.dictionaries(st.sampled_from(["name", "size", "material"]), inner, max_size=3),
+        st.lists(inner, min_size=1, max_size=3).map(lambda options: {"any": options}),
+        st.just({"position": [0, 0, 1], "quaternion": "uniform"}),
+    ),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.sampled_from(["radius", "pose", "shape"]), VALUES), st.integers(0, 2**32))
+@settings(max_examples=200, deadline=None)
+def test_whatever_is_drawn_is_noted(raw: dict[str, Any], seed: int) -> None:
+    """Of any table: decided values are noted under columns that are known beforehand.
+
+    Two draws that note the same decide the same.
+    """
+    table = ScenarioTable(raw, "spec.toml", "body")
+    known = {name for key, v in raw.items() for name, _ in columns_of(v, table, f"body.{key}")}
+    decided: dict[str, Any] = {}
+    for number in range(5):
+        draw = Draw(np.random.default_rng([seed, number]))
+        out = draw.table(raw, table, "body")
+        assert draw.drawn.keys() <= known
+        assert "from" not in repr(out)
+        assert "any" not in repr(out)
+        assert decided.setdefault(repr(draw.drawn), repr(out)) == repr(out)
+    assert known == {PREFIX + n for k, v in raw.items() for n in random_leaves(v, f"body.{k}")}

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -503,3 +504,13 @@ def test_bags_of_others(tmp_path: Path, file: Path, kind: str) -> None:
     strict = ["--force", "--rate", "40", "--timeout", "0.01", "--sensor", "left=left"]
     assert main([*command, *strict]) == OK  # in between, the hand's transform is 25 ms old
     assert [stamp for stamp, _ in bag_of(out)["/left/delta"]] == times
+
+
+def test_missing_cyclonedds(
+    file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cyclonedds.domain", None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", cs.ExperimentalWarning)
+        assert main(["ros", str(file), "--duration", "0.1"]) == BAD_INPUT
+    assert "capsense[live]" in capsys.readouterr().err
