@@ -29,6 +29,7 @@ from capsense.fleet.bodies import (
     require_no_gradient,
 )
 from capsense.fleet.check import FleetCheck, by_simulator, summary
+from capsense.fleet.chips import ChipsOfSensors
 from capsense.fleet.cpu import CpuCore
 from capsense.reading import FleetReading, Reading, StepStats
 from capsense.readout import Readout
@@ -130,8 +131,8 @@ class Fleet:
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self.table = BodyTable(self._solver, count, len(bodies), sensors)
-        self.readout: Readout | None = None
-        """The readout of which every sensor has a chip, if any."""
+        self.readouts: tuple[Readout, ...] = ()
+        """The readout of which every sensor has a chip, or one for each sensor, if any."""
         self._chips: Any = None
         self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
@@ -248,7 +249,7 @@ class Fleet:
 
     def use_readout(
         self,
-        readout: Readout | str | Path | None,
+        readout: Readout | str | Path | Sequence[Readout | str | Path] | None,
         *,
         start: ArrayLike | None = None,
         seed: int | None = None,
@@ -261,7 +262,8 @@ class Fleet:
 
         Args:
             readout: A readout for this design's electrodes, which stays as it is, the name of a
-                chip with its usual settings, the path of a readout file (``.toml``), or None.
+                chip with its usual settings, the path of a readout file (``.toml``), or None; or a
+                list of such, one for each sensor of an environment, with as many channels.
             start: Time at which they are switched on [s], a number or one for each environment; by
                 default 0.
             seed: Of all random numbers, by default the readout's own.
@@ -270,31 +272,60 @@ class Fleet:
 
         Raises:
             ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
-                number from 0 on; the readout is of other electrodes; a randomisation does not fit
+                number from 0 on; a readout is of other electrodes, or there are as many neither as
+                sensors nor as each other's channels; a randomisation does not fit
                 the fleet; or the readout has open electrodes or parts of the user's own, and the
                 fleet is on Warp.
         """
-        self.readout = self._chips = None
+        self.readouts, self._chips = (), None
         if readout is None:
             return
-        chip = copy.deepcopy(make_readout(readout, self))
-        if chip.bank.electrodes != self.electrode_names:
-            raise ReadoutError(
-                f"the readout is of electrodes {chip.bank.electrodes}, the fleet of "
-                f"{self.electrode_names}"
-            )
-        chip.reset(seed=seed)
-        how = {
-            "seed": chip.seed, "start": 0.0 if start is None else start,
-            "randomisation": randomisation,
+        listed = isinstance(readout, Sequence) and not isinstance(readout, str)
+        chips = self._readouts(list(cast("Any", readout)) if listed else [cast("Any", readout)])
+        how: dict[str, Any] = {
+            "seed": seed, "start": 0.0 if start is None else start, "randomisation": randomisation
         }  # fmt: skip
+        if seed is not None:
+            chips[0].reset(seed=seed)
+        if len(chips) == 1:
+            how["seed"] = chips[0].seed
         with self._one:
-            self._chips = (
-                SideBySide(chip, self.count, self.sensors, **how)
-                if self._warp is None
-                else self._warp.chips(chip, self.baseline, how)
+            if self._warp is not None:
+                self._chips = self._warp.chips(chips, self.baseline, how)
+            elif len(chips) == 1:
+                self._chips = SideBySide(chips[0], self.count, self.sensors, **how)
+            else:
+                self._chips = ChipsOfSensors(chips, self._of_one_sensor, **how)
+            self.readouts = tuple(chips)
+
+    def _of_one_sensor(self, number: int, readout: Readout, **how: Any) -> SideBySide:
+        return SideBySide(readout, self.count, **how)
+
+    def _readouts(self, given: Sequence[Readout | str | Path]) -> list[Readout]:
+        """Copies of readouts, of one for all sensors or of one for each."""
+        chips = [copy.deepcopy(make_readout(each, self)) for each in given]
+        if len(chips) not in (1, self.sensors):
+            raise ReadoutError(
+                f"there are {len(chips)} readouts and {self.sensors} sensors; give one for all, or "
+                "one for each"
             )
-            self.readout = chip
+        for chip in chips:
+            if chip.bank.electrodes != self.electrode_names:
+                raise ReadoutError(
+                    f"the readout is of electrodes {chip.bank.electrodes}, the fleet of "
+                    f"{self.electrode_names}"
+                )
+            if len(chip.bank) != len(chips[0].bank):
+                raise ReadoutError(
+                    f"readouts have {len(chips[0].bank)} and {len(chip.bank)} channels; make them "
+                    "the same"
+                )
+        return chips
+
+    @property
+    def readout(self) -> Readout | None:
+        """The readout of which every sensor, or the first, has a chip; None without chips."""
+        return self.readouts[0] if self.readouts else None
 
     @property
     def drawn(self) -> ReadoutRandomisation | None:

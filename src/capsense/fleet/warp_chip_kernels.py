@@ -190,11 +190,17 @@ def _uniform(word: wp.uint64):
 
 
 @wp.func
-def _normal(word: wp.uint64):
+def _normal(key: wp.uint64, sample: int, stages: int, stage: int, column: int):
+    """Of a pair of normal numbers from one word, after Box and Muller."""
+    word = _drawn(key, sample, stages, stage, column // 2)
     half = wp.float64(2.3283064365386963e-10)
     size = (wp.float64(word >> wp.uint64(32)) + wp.float64(0.5)) * half
-    turn = (wp.float64(word & wp.uint64(0xFFFFFFFF)) + wp.float64(0.5)) * half
-    return wp.sqrt(wp.float64(-2.0) * wp.log(size)) * wp.cos(wp.float64(6.283185307179586) * turn)
+    turn = wp.float64(word & wp.uint64(0xFFFFFFFF)) + wp.float64(0.5)
+    turn *= wp.float64(6.283185307179586) * half
+    out = wp.sqrt(wp.float64(-2.0) * wp.log(size))
+    if column % 2 == 0:
+        return out * wp.cos(turn)
+    return out * wp.sin(turn)
 
 
 @wp.kernel
@@ -268,14 +274,14 @@ def _staged(
             scale = a
             if b > wp.float64(0.0):
                 scale = wp.sqrt(a * a + b * b * value * value)
-            word = _drawn(state.keys[k, c], sample, count, stage, 0)
-            value += scale * (_normal(word) * state.noise[k, c])
+            drawn = _normal(state.keys[k, c], sample, count, stage, 0)
+            value += scale * (drawn * state.noise[k, c])
         elif kind == POLES:
             total = wp.float64(0.0)
             for p in range(int(b)):
-                word = _drawn(state.keys[k, c], sample, count, stage, p)
                 at = int(a) + p
-                kick = chip.kick[at] * (_normal(word) * state.noise[k, c])
+                drawn = _normal(state.keys[k, c], sample, count, stage, p)
+                kick = chip.kick[at] * (drawn * state.noise[k, c])
                 state.poles[at, k, c] = chip.keep[at] * state.poles[at, k, c] + kick
                 total += state.poles[at, k, c]
             value += total
@@ -418,8 +424,7 @@ def restart(
     for stage in range(count):
         if chip.stages[stage] == POLES:
             for p in range(int(chip.figures[stage, 1])):
-                word = _drawn(state.keys[k, c], -1, count, stage, p)
-                drawn = _normal(word) * state.noise[k, c]
+                drawn = _normal(state.keys[k, c], -1, count, stage, p) * state.noise[k, c]
                 at = int(chip.figures[stage, 0]) + p
                 state.poles[at, k, c] = chip.figures[stage, 2] * drawn
 

@@ -36,6 +36,12 @@ from capsense.readout.side_by_side import ManyChips
 _WORDS = {"keys": wp.uint64}
 
 
+def registers(device: Any, *shape: int) -> Held:
+    """Room for what chips hold, of that shape."""
+    room = (wp.zeros(shape, dtype=d, device=device) for d in (wp.float64, wp.int64, wp.float64))
+    return Held(*room)
+
+
 class WarpChips(ManyChips):
     """Chips on a device.
 
@@ -45,6 +51,7 @@ class WarpChips(ManyChips):
         sensors: How many each has.
         empty: Maxwell matrix of the electrodes in the empty domain [F], shape (n, n).
         device: Warp's device.
+        held: Where registers are written, shape (e, s, K); by default in memory of their own.
         **how: As of :class:`ManyChips`.
 
     Raises:
@@ -53,7 +60,7 @@ class WarpChips(ManyChips):
 
     def __init__(
         self, readout: Readout, environments: int, sensors: int, empty: Array, device: Any,
-        **how: Any,
+        held: Held | None = None, **how: Any,
     ) -> None:  # fmt: skip
         self._device = device
         super().__init__(readout, environments, sensors, **how)
@@ -70,8 +77,7 @@ class WarpChips(ManyChips):
         state.poles = self._room(len(self._chip.keep), k, chips)
         self._state, self._time = state, self._room(e)
         self._which = self._room(e, dtype=wp.int32)
-        code = self._room(e, s, k, dtype=wp.int64)
-        self._held = Held(self._room(e, s, k), code, self._room(e, s, k))
+        self._held = held or registers(device, e, s, k)
         for name, values in self._lanes().items():
             setattr(state, name, self._array(values, _WORDS.get(name, wp.float64)))
         self._ready = True

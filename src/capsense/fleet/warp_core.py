@@ -18,11 +18,13 @@ from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
 from capsense.fleet.bodies import Bodies, on_device
-from capsense.fleet.warp_chips import WarpChips
+from capsense.fleet.chips import ChipsOfSensors
+from capsense.fleet.warp_chips import WarpChips, registers
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
 from capsense.reading import FleetTouch
 from capsense.readout import Readout
+from capsense.readout.conversions import Held
 from capsense.solver.gap.touch_kernels import COARSE, FINE
 from capsense.solver.surface_solver import SurfaceSolver
 from capsense.solver.tree.rigid import RigidShape
@@ -396,9 +398,20 @@ class WarpCore:
             warp_fabric.add_slopes, size, self.circuit, fabric, self.cut.moved, found, volts, out
         )
 
-    def chips(self, readout: Readout, empty: Array, how: Mapping[str, Any]) -> WarpChips:
-        """Chips for all sensors, see :class:`WarpChips`."""
-        return WarpChips(readout, self.counts[0], self.counts[2], empty, self.device, **how)
+    def chips(
+        self, readouts: Sequence[Readout], empty: Array, how: Mapping[str, Any]
+    ) -> WarpChips | ChipsOfSensors:
+        """Chips for all sensors, of one readout or of one each, see :class:`WarpChips`."""
+        e, _, s = self.counts
+        if len(readouts) == 1:
+            return WarpChips(readouts[0], e, s, empty, self.device, **how)
+        whole = registers(self.device, e, s, len(readouts[0].bank))
+
+        def make(number: int, readout: Readout, **own: Any) -> WarpChips:
+            part = Held(*(column[:, number : number + 1] for column in vars(whole).values()))
+            return WarpChips(readout, e, 1, empty, self.device, held=part, **own)
+
+        return ChipsOfSensors(readouts, make, registers=whole, **how)
 
     def launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:
         """Launch a kernel on the device."""

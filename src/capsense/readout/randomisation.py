@@ -126,6 +126,15 @@ class ReadoutRandomisation:
             return float(value.values(np.array(1.0 - _EDGE)))
         return float(np.max(value))
 
+    def of_sensor(self, number: int, count: int) -> ReadoutRandomisation:
+        """What it says of one sensor of several."""
+        part = {}
+        for name in FIGURES:
+            value = getattr(self, name)
+            many = not isinstance(value, Distribution) and np.shape(value)[-2:-1] == (count,)
+            part[name] = np.asarray(value)[..., number : number + 1, :] if many else value
+        return ReadoutRandomisation(**part)
+
     def draw(self, keys: Words, rows: Ints, shape: tuple[int, int, int, int]) -> dict[str, Array]:
         """Figures of some environments, by name.
 

@@ -25,10 +25,12 @@ COLUMNS = 256
 
 def mixed(words: Words) -> Words:
     """Words of 64 bits, each made another one."""
-    out = np.asarray(words, dtype=np.uint64)
-    out = (out ^ (out >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    out = (out ^ (out >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(out ^ (out >> np.uint64(31)), dtype=np.uint64)
+    out = np.array(words, dtype=np.uint64)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        out ^= out >> np.uint64(shift)
+        out *= np.uint64(factor)
+    out ^= out >> np.uint64(31)
+    return out
 
 
 def drawn(keys: Words, count: Any) -> Words:
@@ -47,12 +49,25 @@ def uniform(words: Words) -> Array:
     return ((words >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
 
 
-def normal(words: Words) -> Array:
-    """Standard normal numbers of random bits."""
+def normal(words: Words, count: int) -> Array:
+    """Standard normal numbers of random bits, two a word.
+
+    Args:
+        words: Shape (m, p).
+        count: How many columns, 2 p or one less.
+
+    Returns:
+        Shape (m, count).
+    """
     half = 2.0**-32
     size = ((words >> np.uint64(32)).astype(float) + 0.5) * half
-    turn = ((words & np.uint64(0xFFFFFFFF)).astype(float) + 0.5) * half
-    return np.sqrt(-2.0 * np.log(size)) * np.cos(2.0 * math.pi * turn)
+    size = np.sqrt(-2.0 * np.log(size))
+    turn = ((words & np.uint64(0xFFFFFFFF)).astype(float) + 0.5) * (2.0 * math.pi * half)
+    out = np.empty((len(words), count))
+    out[:, ::2] = size * np.cos(turn)
+    second = count // 2
+    out[:, 1::2] = size[:, :second] * np.sin(turn[:, :second])
+    return out
 
 
 class Streams:
@@ -82,7 +97,8 @@ class Streams:
     def standard_normal(self, size: int | tuple[int, int]) -> Array:
         """Of the samples chosen, shape (m,) or (m, columns)."""
         columns = 1 if isinstance(size, int) else size[1]
-        found = normal(self._words(self._channel, self._sample, np.arange(columns)))
+        pairs = np.arange((columns + 1) // 2)
+        found = normal(self._words(self._channel, self._sample, pairs), columns)
         found *= self._scale.reshape(-1)[self._channel, None]
         return found[:, 0] if isinstance(size, int) else found
 

@@ -394,6 +394,48 @@ def test_a_fleet_restarts_environments(device):
     one.reset([0])
 
 
+@pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
+def test_each_sensor_has_a_readout_of_its_own(device, tmp_path):
+    """Differential: sensors with chips of their own read as fleets of one such sensor."""
+    if device != "cpu":
+        pytest.importorskip("warp")
+    rng = np.random.default_rng(10)
+    file = tmp_path / "left.toml"
+    fit = LinearSensor(rng.uniform(0.9, 1.1, 6), rng.uniform(0, 1e-13, 6), np.zeros(6), 0.0)
+    file.write_text('chip = "fdc1004"\nrandom = false\n' + fit.toml(), encoding="utf-8")
+    given = [file, plain("ad7747", seed=3)]
+    gains = rng.uniform(0.9, 1.1, (2, 6))
+    frames = poses(rng, 3, 2, low=(-0.02, -0.02, 0.0), high=(0.02, 0.02, 0.01))
+    frames[..., 3:] = [0.0, 0.0, 0.0, 1.0]
+    both = Fleet("six_patch", BODIES[:1], 3, sensors=2, device=device, budget=32)
+    both.use_readout(given, randomisation=ReadoutRandomisation(gain=gains, delay=0.001))
+    assert [r.schedule.period for r in both.readouts] == [0.04, plain("ad7747").schedule.period]
+    ones = [Fleet("six_patch", BODIES[:1], 3, device=device, budget=32) for _ in given]
+    for one, readout, gain in zip(ones, given, gains, strict=True):
+        one.use_readout(readout, randomisation=ReadoutRandomisation(gain=gain, delay=0.001))
+    for k in range(8):
+        where, time = poses(rng, 3, 1), 0.03 * k + np.array([0.0, 0.1, 0.2])
+        if k == 4:
+            for fleet in (both, *ones):
+                fleet.reset([1], start=0.2)
+        held = both.step(where, frames, time=time).held
+        for number, one in enumerate(ones):
+            truth = one.step(where, frames[:, [number]], time=time).held
+            for column in ("code", "capacitance", "age"):
+                each = [getattr(h, column) for h in (held, truth)]
+                each = each if device == "cpu" else [x.numpy() for x in each]
+                np.testing.assert_array_equal(each[0][:, [number]], each[1])
+    np.testing.assert_array_equal(both.drawn.gain, np.broadcast_to(gains, (3, 2, 6)))
+    for wrong, words in (
+        (["fdc1004"] * 3, "there are 3 readouts and 2 sensors"),
+        (["fdc1004", "sdr"], "readouts have 6 and 15 channels"),
+        (["fdc1004", 3], "readout is 3; give a chip's name, a file, or a Readout"),
+        ([], "there are 0 readouts"),
+    ):
+        with pytest.raises(ReadoutError, match=words):
+            both.use_readout(wrong)
+
+
 def test_times_and_environments_on_the_device():
     """Differential: arrays of Warp beside those of the host, in single and double precision."""
     wp = pytest.importorskip("warp")
