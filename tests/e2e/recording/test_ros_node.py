@@ -21,7 +21,7 @@ from capsense.__main__ import main
 from capsense.cli import BAD_INPUT, OK
 from capsense.recording import ros
 from capsense.recording.node import RosSensors
-from capsense.scenario import Scenario, load_scenario
+from capsense.scenario import Excitation, MovingBody, Scenario, load_scenario
 
 S = 10**9
 SCENARIO = """
@@ -514,3 +514,37 @@ def test_missing_cyclonedds(
         warnings.simplefilter("ignore", cs.ExperimentalWarning)
         assert main(["ros", str(file), "--duration", "0.1"]) == BAD_INPUT
     assert "capsense[live]" in capsys.readouterr().err
+
+
+def test_touch(foam_field: cs.Design) -> None:
+    """A ball that sinks into a foam: forces and compressions, and what a chip's detector says."""
+    ball = cs.Body(cs.Sphere(0.01), cs.Pose(), "steel", name="ball")
+    body = MovingBody(ball)
+    scenario = Scenario(
+        name="ball", design=foam_field, bodies=(body,), sample_rate=50.0, duration=1.0,
+        excitation=Excitation.MATRIX,
+    )  # fmt: skip
+    made = RosSensors(scenario, {"pad": "pad"}, {}, readout="mpr121")
+    simulator = cs.Simulator(foam_field)
+    out: dict[str, Any] = {}
+    places = [0.05] * 30 + [0.0115] * 30
+    for k, z in enumerate(places):
+        place = ((-0.012, 0.0, z), (0.0, 0.0, 0.0, 1.0))
+        given = [((divmod(k * S // 50, S), "pad"), "ball", place)]
+        made.hear(ros.make("tf2_msgs/msg/TFMessage", transforms=given), fixed=False)
+        out = dict(made.tick(k * S // 50))
+        scene = cs.Scene([ball.moved(cs.Pose((-0.012, 0.0, z)))])
+        reading = simulator.step(scene, time=k / 50)
+        if k == 29:
+            assert not out["/pad/touched"].data.any()
+            assert out["/pad/touch_total"].data == 0.0
+    assert reading.touch is not None
+    assert reading.touch.total > 0.01
+    assert out["/pad/touch_total"].data == reading.touch.total
+    rows = out["/pad/touch"].data.reshape(2, -1)
+    np.testing.assert_array_equal(rows, [reading.touch.force, reading.touch.compression])
+    points = points_of(out["/pad/points"])
+    np.testing.assert_array_equal(points["compression"], reading.touch.compression)
+    touched = out["/pad/touched"].data
+    assert touched[int(np.argmax(reading.touch.force))] == 1
+    assert points_of(out["/pad/channel_points"])["touched"].tolist() == touched.tolist()
