@@ -167,7 +167,7 @@ def test_files_and_readouts_in_place_of_a_chip(tmp_path: Path) -> None:
     )
     names = cs.Simulator("six_patch").electrode_names
     middle = dataclasses.replace(Randomisation().held(), latency=(0.02, 0.02))
-    for chip in (str(path), path, cs.Readout.preset(path, names)):
+    for chip in (str(path), path, cs.load_readout(path, names)):
         env = gymnasium.make(FOLLOW, randomisation=middle, chip=chip).unwrapped
         env.reset(seed=0)
         found = env.signals.readouts["pad"]

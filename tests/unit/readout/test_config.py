@@ -407,7 +407,7 @@ def test_choosing_by_name_or_file(tmp_path):
         choose_readout("mpr122", NAMES, empty)
 
 
-def test_a_file_in_place_of_a_name(tmp_path):
+def test_a_file_with_options(tmp_path):
     """Options go before what the file says; its curve and its calibration stay, in that order."""
     path = tmp_path / "mine.toml"
     curve = ResponseCurve(np.array([0.0, 1e-12, 2e-12]), 1e-12 * np.arange(9.0).reshape(3, 3))
@@ -415,7 +415,7 @@ def test_a_file_in_place_of_a_name(tmp_path):
     head = 'chip = "fdc1004"\nrate = 200\nrandom = false\n'
     path.write_text(head + fit.toml() + curve.toml(), encoding="utf-8")
     gain = LinearSensor(np.array(1.1), np.array(0.0), np.array(0.0), 0.0)
-    readout = Readout.preset(path, NAMES, rate=400, stages=[gain])
+    readout = load_readout(path, NAMES, rate=400, stages=[gain])
     assert readout.schedule.conversion == approx(2.5e-3, rel=1e-12)
     first, second, third = readout.stages
     assert first is gain
@@ -424,7 +424,11 @@ def test_a_file_in_place_of_a_name(tmp_path):
     np.testing.assert_array_equal(third.gain, fit.gain)
     assert load_readout(str(path), NAMES).schedule.conversion == approx(5e-3, rel=1e-12)
     with pytest.raises(ReadoutError, match="no option 'speed'"):
-        Readout.preset(str(path), NAMES, speed=3)
+        load_readout(str(path), NAMES, speed=3)
+    with pytest.raises(
+        ReadoutError, match=r"load_readout\('.*mine.toml', electrodes, …\) takes it"
+    ):
+        Readout.preset(str(path), NAMES)
     for content, words in (
         ("[curve]\ntrue = [0.0, 1e-12]\n", r"mine.toml.*curve.*missing key 'measured'"),
         ('[curve]\ntrue = ["a", "b"]\nmeasured = [0.0, 1.0]\n', "mine.toml.*no real numbers"),
