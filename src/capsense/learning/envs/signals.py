@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from capsense.adapters import mujoco as adapter
 from capsense.errors import SceneError
-from capsense.learning.scenes import settled, settling
+from capsense.learning.chips import settled, settling
 from capsense.reading import Reading
 from capsense.readout import SEED_STRIDE, Readout
 from capsense.readout.config import make_readout
