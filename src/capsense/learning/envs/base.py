@@ -224,7 +224,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     """Of the actuators, in their order [m/s or rad/s]."""
     parts: ClassVar[tuple[str, ...]]
     """Segments of the arm that are there."""
-    camera: ClassVar[Camera] = Camera((0.55, -0.75, 0.55), (0.05, 0.0, 0.0))
+    camera: ClassVar[Camera] = Camera((0.4, -0.6, 0.25), (0.06, 0.0, -0.02))
     """Where pictures are taken from."""
     extra: ClassVar[tuple[str, ...]] = ()
     """Names of the numbers that :meth:`also` adds to observations."""

@@ -223,7 +223,7 @@ class WhoIsThereVector(VectorEnv[Floats, Floats, NDArray[Any]]):
         reward = np.where(new, 0.0, np.maximum(-1.0, 1.0 - facts["error"] / COST))
         cut = ~new & (self._steps >= (self._limit or np.inf))
         over = np.zeros(self.num_envs, np.bool_)
-        self._over = cut
+        self._over = cut.copy()
         if cut.any() and self._mode == AutoresetMode.SAME_STEP:
             final = observation, facts
             self._begin(cut)
