@@ -11,10 +11,10 @@ Readings that policies are trained on:
 - ``field, self``: the same without the mutual channels;
 - ``plates``: ε₀A/d of each electrode, d the distance from its centre to the body, scaled to the
   field's mean at 5 cm; it has no mutual capacitances, so policies get the self channels alone;
-- ``fitted``: every channel, mutual ones too, is the bank's mean at that gap: of all functions of the
-  distance the one with the least squared error;
-- ``range``: the gap itself with noise of 1 mm rms, in training and when judged: what an ideal range
-  sensor gives.
+- ``fitted``: every channel, mutual ones too, is the bank's mean at that gap: of all functions of
+  the distance the one with the least squared error;
+- ``range``: the gap itself with noise of 1 mm rms, in training and when judged: what an ideal
+  range sensor gives.
 
 Protocol: the gap follows from actions by the environment's own rule, so gradients of the return are
 propagated through an episode of 30 steps (Adam, the same steps and networks for all). White noise
@@ -207,14 +207,16 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--scenes", type=int, default=600)
     parser.add_argument("--episodes", type=int, default=60, help="of each training")
+    parser.add_argument("--kinds", nargs="+", default=[*KINDS, "idle"], help="of readings")
+    parser.add_argument("--variants", type=int, default=len(VARIANTS), help="the first so many")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     head = "| task | trained on | return | error of the gap [cm] | within 1 cm [%] | by class [%] |"
     lines, results = [head, "|---|---|---|---|---|---|"], {}
-    for variant, how in VARIANTS.items():
+    for variant, how in list(VARIANTS.items())[: options.variants]:
         known = bank(options.scenes, how)
-        for kind in (*KINDS, "idle"):
+        for kind in options.kinds:
             start, policies = perf_counter(), None
             if kind != "idle":
                 policies = train(kind, known, options.updates, options.batch)
