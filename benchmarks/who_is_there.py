@@ -39,7 +39,13 @@ from scipy.stats import t as student
 from capsense.constants import EPS0
 from capsense.learning.envs.scale import LIMIT, UNIT, compressed
 from capsense.learning.envs.who import (
-    COST, FURTHEST, NEAREST, SPEED, STEP, TARGETS, WhoIsThereVector,
+    COST,
+    FURTHEST,
+    NEAREST,
+    SPEED,
+    STEP,
+    TARGETS,
+    WhoIsThereVector,
 )  # fmt: skip
 
 STEPS = 30
@@ -228,7 +234,8 @@ def main() -> None:
                    told(means["success"], 0), by_class]  # fmt: skip
             lines.append(f"| {' | '.join(row)} |")
             results[f"{variant}: {kind}"] = {k: v.tolist() for k, v in means.items()} | {
-                "seconds": perf_counter() - start, "by_class": by_class
+                "seconds": perf_counter() - start,
+                "by_class": by_class,
             }
             print(lines[-1], f"{perf_counter() - start:.0f} s", flush=True)
             facts = {"machine": describe_machine(("capsense", "torch")), "results": results,

@@ -36,7 +36,7 @@ def together(name: str, count: int, **options: Any) -> Any:
 
 @pytest.mark.parametrize("name", IDS)
 def test_pictures(name: str) -> None:
-    """Gymnasium's checks with rendering; a picture changes with the scene, and is not one colour."""
+    """Gymnasium's checks with rendering; a picture has several colours, and changes."""
     env = gymnasium.make(name, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.reset(seed=1)

@@ -309,7 +309,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         return draw_world(self.model, self.data, self.camera, electrodes)
 
     def _loud(self, site: str) -> Array:
-        """How much each electrode of a sensor feels, from 0 to 1; all the same by other channels."""
+        """How much each electrode of a sensor feels, from 0 to 1; by other channels, their mean."""
         n, felt = len(self.simulator.electrode_names), self.signals.felt.get(site)
         if felt is None:
             return np.zeros(n)

@@ -27,9 +27,7 @@ _CUTOFF = 20.0
 """Rays end here [m]."""
 _THROUGH = 0.02
 """Electrodes are seen through so much of what carries them [m]."""
-_INSIDE = np.array(
-    [[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)], float
-) / 8.0
+_INSIDE = np.array([[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)], float) / 8.0
 """Points of a triangle that are drawn, as weights of its corners."""
 
 

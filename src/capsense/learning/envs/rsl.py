@@ -78,7 +78,7 @@ class RslVecEnv(VecEnv):
         log = {
             f"/{name}": float(np.mean(np.asarray(values, float)))
             for name, values in facts.items()
-            if not name.startswith("_") and getattr(values, "dtype", object) != object
+            if not name.startswith("_") and np.asarray(values).dtype.kind in "bif"
         }
         extras = {"time_outs": torch.as_tensor(cut & ~over, device=self.device), "log": log}
         reward = torch.as_tensor(rewards, dtype=torch.float32, device=self.device)

@@ -1,4 +1,4 @@
-"""A task whose right action depends on what stands before the sensor, and not on its distance alone.
+"""A task whose right action depends on what is there, and not on its distance alone.
 
 It needs no physics engine: one call of a :class:`~capsense.fleet.Fleet` reads all environments.
 """
@@ -83,8 +83,9 @@ class WhoIsThereVector(VectorEnv[Floats, Floats, NDArray[Any]]):
     the pad's normal [0.2 m/s], positive towards the body. Observations: changes of the 6 self and
     15 mutual channels since the tare [10 fF], the distance moved since the episode's beginning [m],
     and the last action. Reward of a step: ``1 - |e| / 5 cm``, at least -1, of the error e of the
-    gap from the right one, :data:`TARGETS`. Episodes do not end early. Facts: ``gap`` [m], ``error`` [m],
-    ``kind`` (number of the class in :data:`TARGETS`), ``success`` (\\|e\\| below 1 cm).
+    gap from the right one, :data:`TARGETS`. Episodes do not end early. Facts: ``gap`` and
+    ``error`` [m], ``kind`` (number of the class in :data:`TARGETS`), ``success`` (an error below
+    1 cm).
 
     Episodes depend on the seed; the noise of chips also on the environment's number.
 
@@ -94,7 +95,8 @@ class WhoIsThereVector(VectorEnv[Floats, Floats, NDArray[Any]]):
         classes: Those that are drawn, all by default.
         gap: Range of the gap at the beginning [m].
         chip: A readout of six electrodes, a readout file, or the name of a chip.
-        normalise: Changes of capacitance within ±1; see :func:`~capsense.learning.envs.scale.compressed`.
+        normalise: Whether changes of capacitance are within ±1, see
+            :func:`~capsense.learning.envs.scale.compressed`.
         autoreset_mode: ``"NextStep"`` or ``"SameStep"``, as of Gymnasium.
         preset: How finely the solver resolves surfaces.
         device: As of a fleet.
