@@ -43,7 +43,7 @@ class SB3VecEnv(VecEnv):
 
     def reset(self) -> NDArray[Any]:
         """Begin all episodes, with the seeds that were set last; each is used once."""
-        seeds = None if all(s is None for s in self._seeds) else list(self._seeds)
+        seeds: Any = None if all(s is None for s in self._seeds) else list(self._seeds)
         observation, facts = self.envs.reset(seed=seeds)
         self.reset_infos = facts_of_each(facts, self.num_envs)
         self._reset_seeds()

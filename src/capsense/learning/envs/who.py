@@ -26,6 +26,7 @@ from capsense.learning.envs.scale import LIMIT, TARES, UNIT, compressed
 from capsense.readout import Readout
 from capsense.readout.channels import mutual_patterns, self_patterns
 from capsense.readout.config import make_readout
+from capsense.readout.conversions import Held
 from capsense.readout.randomisation import Distribution, ReadoutRandomisation
 from capsense.scene import Body, Capsule, Pose
 from capsense.scene import Box as BoxShape
@@ -71,7 +72,7 @@ def _bodies() -> dict[str, list[Body]]:
                 body = Body(limb, Pose(), "human", "grounded" if tie == "grounded" else PERSON)
             else:
                 bar = BoxShape((LENGTH, 2 * size, 2 * size))
-                body = Body(bar, Pose(), "steel", tie)
+                body = Body(bar, Pose(), "steel", "grounded" if tie == "grounded" else "floating")
             out.setdefault(name, []).append(body)
     return out
 
@@ -288,7 +289,7 @@ class WhoIsThereVector(VectorEnv[Floats, Floats, NDArray[Any]]):
 
     def _told(self, poses: Array) -> Array:
         """What the chips hold [F], shape (n, K)."""
-        held = self.fleet.step(poses, time=self._clock).held
+        held = cast("Held", self.fleet.step(poses, time=self._clock).held)
         values = held.capacitance
         return np.asarray(values if isinstance(values, np.ndarray) else values.numpy())[:, 0]
 
