@@ -37,7 +37,7 @@ from capsense.learning.envs.signals import (  # noqa: E402
 scripted = SimpleNamespace(
     **runpy.run_path(str(Path(__file__).parents[3] / "examples" / "policies.py"))
 )
-FOLLOW, DRESS, STOP = IDS
+FOLLOW, DRESS, STOP, _ = IDS
 TIP = cs.Pose((0.0, 0.0, 0.03))
 """A sensor on the fingertip of Gymnasium's Reacher, looking up."""
 
