@@ -24,12 +24,13 @@ from capsense.fleet.bodies import (
     BodyTable,
     checked_forces,
     checked_poses,
+    chosen_rows,
     on_device,
     require_no_gradient,
 )
 from capsense.fleet.check import FleetCheck, by_simulator, summary
 from capsense.fleet.cpu import CpuCore
-from capsense.reading import FleetReading, Reading, StepStats
+from capsense.reading import FleetReading, FleetTouch, Reading, StepStats
 from capsense.readout import Readout
 from capsense.readout.config import make_readout
 from capsense.readout.side_by_side import SideBySide
@@ -131,6 +132,7 @@ class Fleet:
         self.readout: Readout | None = None
         """The readout of which every sensor has a chip, if any."""
         self._chips: Any = None
+        self._last: FleetReading | None = None
         self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
         self._warp = None if device == "cpu" else self._on_warp(budget)
@@ -317,6 +319,7 @@ class Fleet:
         forces: ArrayLike | None = None,
         time: Any = None,
         jacobian: bool = False,
+        environments: Any = None,
     ) -> FleetReading:
         """Return the readings of all environments.
 
@@ -336,17 +339,23 @@ class Fleet:
                 Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
                 graphs.
             jacobian: Whether to work out ``reading.jacobian`` as well.
+            environments: Which environments are solved, numbers or a mask of shape (e,); all by
+                default. The reading holds for each of the others what it held last, and before its
+                first what an empty environment gives. On Warp it may be a mask on the device.
 
         Raises:
-            SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long;
-                there are forces and no cover, or a Jacobian is asked for with forces.
+            SceneError: There is no such environment; poses are of a wrong shape, not finite, or their quaternions not 1 long;
+                there are forces and no cover, or a Jacobian is asked for with forces or
+                of some environments.
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
         """
         if self._chips is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
         with self._one:
-            reading = self.solved(poses, sensors, forces=forces, jacobian=jacobian)
+            reading = self.solved(
+                poses, sensors, forces=forces, jacobian=jacobian, environments=environments
+            )
             if self._chips is None:
                 return reading
             matrix = reading.delta
@@ -384,9 +393,13 @@ class Fleet:
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *,
-        forces: ArrayLike | None = None, jacobian: bool = False,
+        forces: ArrayLike | None = None, jacobian: bool = False, environments: Any = None,
     ) -> FleetReading:  # fmt: skip
         """As :meth:`step`, without chips and their time."""
+        if jacobian and environments is not None:
+            raise SceneError(
+                "a Jacobian is asked for of some environments; leave environments out, or jacobian"
+            )
         if jacobian and self.table.lossy:
             raise SceneError(
                 "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
@@ -397,12 +410,17 @@ class Fleet:
         if self._warp is None:
             if sensors is None:
                 sensors = np.broadcast_to(WORLD, shapes[1])
-            return self._cpu.step(
-                checked_poses("poses", poses, shapes[0]),
-                checked_poses("sensors", sensors, shapes[1]),
-                held,
+            rows = None if environments is None else chosen_rows(environments, self.count)
+            pick = slice(None) if rows is None else rows
+            found = self._cpu.step(
+                checked_poses("poses", poses, shapes[0])[pick],
+                checked_poses("sensors", sensors, shapes[1])[pick],
+                held[pick],
                 jacobian,
+                rows,
             )
+            self._last = found if rows is None else _with_rows(self._last_or_empty(), rows, found)
+            return self._last
         for name, each in (("poses", poses), ("sensors", sensors)):
             require_no_gradient(name, each)
         where, at = (
@@ -412,12 +430,28 @@ class Fleet:
             )
         )
         core = self._warp
-        core.solve(where, at, None if forces is None else held)
+        core.solve(where, at, None if forces is None else held, environments)
         return FleetReading(
             core.capacitance, core.delta, self.electrode_names, core.error,
             shield_coupling=core.shields,
             conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
             touch=core.touch,
+        )  # fmt: skip
+
+    def _last_or_empty(self) -> FleetReading:
+        """The last reading on the CPU; before the first, that of empty environments."""
+        if self._last is not None:
+            return self._last
+        empty, shape = self.empty, (self.count, self.sensors)
+
+        def everywhere(values: Array) -> Array:
+            return np.broadcast_to(values, (*shape, *values.shape)).copy()
+
+        each = np.zeros((*shape, len(self.baseline)))
+        touch = None if self.design.cover is None else FleetTouch(each, each, np.zeros(shape))
+        return FleetReading(
+            everywhere(empty.capacitance), everywhere(empty.delta), self.electrode_names,
+            np.zeros(shape), everywhere(empty.shield_coupling), touch=touch,
         )  # fmt: skip
 
     def check(
@@ -506,3 +540,29 @@ class Fleet:
         """
         nodes = None if self._warp is None else self._warp.gap.slots
         return self._cpu.lifted(poses, sensors, rows, nodes)
+
+
+def _with_rows(
+    reading: FleetReading, rows: NDArray[np.int64], found: FleetReading
+) -> FleetReading:
+    """A reading whose rows are those of another of so many environments, but for its Jacobian."""
+
+    def merged(old: Any, new: Any) -> Any:
+        if old is None and new is None:
+            return None
+        if old is None:
+            old = np.zeros((len(reading.delta), *new.shape[1:]))
+        out = np.array(old)
+        out[rows] = 0.0 if new is None else new
+        return out
+
+    names = ("capacitance", "delta", "error", "shield_coupling", "conductance")
+    values = {name: merged(getattr(reading, name), getattr(found, name)) for name in names}
+    if reading.touch is not None and found.touch is not None:
+        parts = (merged(*both) for both in zip(_of(reading.touch), _of(found.touch), strict=True))
+        values["touch"] = FleetTouch(*parts)
+    return replace(reading, jacobian=None, held=None, **values)
+
+
+def _of(touch: FleetTouch) -> tuple[Any, Any, Any]:
+    return touch.force, touch.compression, touch.total

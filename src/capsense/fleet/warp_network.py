@@ -161,7 +161,7 @@ def _doubt(t: int, nodes: int, i: int, left: Left, whole: wp.array3d(dtype=wp.ve
 
 @wp.kernel
 def report(
-    circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d),
+    circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d), due: wp.array(dtype=wp.int32),
     capacitance: wp.array4d(dtype=wp.float32), delta: wp.array4d(dtype=wp.float32),
     conductance: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
     doubt: wp.array2d(dtype=wp.float32), error: wp.array2d(dtype=wp.float32),
@@ -170,6 +170,8 @@ def report(
     i, v = wp.tid()
     e = v // delta.shape[1]
     s = v % delta.shape[1]
+    if due[e] == 0:
+        return
     for j in range(circuit.electrodes):
         value = whole[i, j, v]
         capacitance[e, s, i, j] = wp.float32(value[0])

@@ -1,0 +1,112 @@
+"""Steps of some environments: they are solved, and the others hold what they read last."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fleet_scenes import BODIES, frames, poses
+
+import capsense as cs
+from capsense.errors import SceneError
+
+COVERED = """
+name = "covered"
+[domain]
+size = [0.2, 0.2, 0.1]
+[[electrode]]
+name = "E1"
+disc = { radius = 0.01 }
+[[cover]]
+thickness = 0.001
+permittivity = 3.0
+pressures = [10e3, 30e3]
+strains = [0.1, 0.2]
+"""
+FIELDS = ("capacitance", "delta", "error", "shield_coupling")
+
+
+def host(values):
+    return np.array(values if isinstance(values, np.ndarray) else values.numpy())
+
+
+def numbers(reading):
+    """All numbers of a reading, on the host."""
+    out = {name: host(getattr(reading, name)) for name in FIELDS}
+    if reading.conductance is not None:
+        out["conductance"] = host(reading.conductance)
+    if reading.touch is not None:
+        touch = reading.touch
+        out |= {f"touch {k}": host(x) for k, x in enumerate((touch.force, touch.total))}
+    return out
+
+
+@pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
+def test_others_hold_their_last_reading(device):
+    """Differential: solved ones against a step of all; the others against the step before."""
+    if device != "cpu":
+        pytest.importorskip("warp")
+    rng = np.random.default_rng(4)
+    lossy = cs.Material("wet", 5.0, 1e-5)
+    bodies = [*BODIES[1:], cs.Body(cs.Sphere(0.01), material=lossy)]
+    fleet = cs.Fleet("six_patch", bodies, 4, sensors=2, device=device, budget=32)
+    places, at = [poses(rng, 4, 3) for _ in range(2)], frames(rng, 4, 2)
+    first, second = (numbers(fleet.step(each, at)) for each in places)
+    due = np.array([False, True, False, True])
+    fleet.step(places[0], at)
+    for given in (due, np.flatnonzero(due)):
+        some = numbers(fleet.step(places[1], at, environments=given))
+        assert some.keys() == first.keys()
+        for name, values in some.items():
+            np.testing.assert_array_equal(values[due], second[name][due], err_msg=name)
+            np.testing.assert_array_equal(values[~due], first[name][~due], err_msg=name)
+    none = numbers(fleet.step(places[0], at, environments=[]))
+    np.testing.assert_array_equal(none["delta"], some["delta"])
+
+
+@pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
+def test_before_the_first_reading_they_are_empty(device, tmp_path):
+    """Known values: the baseline, no change, no touch."""
+    if device != "cpu":
+        pytest.importorskip("warp")
+    (tmp_path / "covered.toml").write_text(COVERED)
+    ball = cs.Body(cs.Sphere(0.01))
+    fleet = cs.Fleet(tmp_path / "covered.toml", [ball], 3, device=device)
+    where = np.zeros((3, 1, 7))
+    where[..., 2], where[..., 6] = 0.0106, 1.0
+    reading = fleet.step(where, environments=[1])
+    found = numbers(reading)
+    assert found["touch 1"][1, 0] > 0.01
+    for e in (0, 2):
+        np.testing.assert_allclose(found["capacitance"][e, 0], fleet.baseline, rtol=1e-6)
+        for name in ("delta", "error", "touch 0", "touch 1"):
+            assert not found[name][e].any(), name
+    np.testing.assert_allclose(
+        reading.self_capacitance[0, 0], fleet.empty.self_capacitance, rtol=1e-6
+    )
+
+
+def test_a_mask_on_the_device():
+    """Differential: against the same mask on the host; arrays of Warp and of PyTorch."""
+    wp, torch = pytest.importorskip("warp"), pytest.importorskip("torch")
+    fleet = cs.Fleet("patch", [cs.Body(cs.Sphere(0.01))], 3, device="warp:cpu", budget=32)
+    where = np.zeros((3, 1, 7))
+    where[..., 2], where[..., 6] = 0.03, 1.0
+    due = np.array([True, False, True])
+    truth = host(fleet.step(where, environments=due).delta)
+    assert (truth[[0, 2]] != 0).any(axis=(1, 2, 3)).all() and not truth[1].any()
+    for mask in (wp.array(due, dtype=wp.bool, device="cpu"), torch.tensor(due)):
+        again = cs.Fleet("patch", [cs.Body(cs.Sphere(0.01))], 3, device="warp:cpu", budget=32)
+        np.testing.assert_array_equal(host(again.step(where, environments=mask).delta), truth)
+    with pytest.raises(SceneError, match="bool of shape"):
+        fleet.step(where, environments=torch.tensor([1, 0, 1]))
+
+
+def test_refused():
+    fleet = cs.Fleet("patch", [cs.Body(cs.Sphere(0.01))], 3)
+    where = np.zeros((3, 1, 7))
+    where[..., 6] = 1.0
+    for wrong in ([3], [-1], [True, False], [0.5], "all"):
+        with pytest.raises(SceneError, match="numbers from 0 to 2, or a mask of 3"):
+            fleet.step(where, environments=wrong)
+    with pytest.raises(SceneError, match="a Jacobian is asked for of some environments"):
+        fleet.step(where, environments=[1], jacobian=True)
