@@ -202,7 +202,6 @@ class Terrain:
         more, first = math.ceil(reach / width), int(self._first(axis, np.asarray(at)))
         return slice(max(0, first - more), min(cells, first + many + more) + 1)
 
-
     def _cells(self, axis: int) -> int:
         """How many cells a tile has along x (0) or y (1)."""
         return max(1, round(_TILE / self._cell(axis)))

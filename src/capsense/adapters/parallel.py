@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self, no_type_check
+from typing import Any, Self, TypeVar, no_type_check
 
 import numpy as np
 import warp as wp
@@ -311,7 +311,8 @@ class ParallelSensors:
         reach = 0.5 * max(self.design.domain.size)
         for part, before in self._tiles.items():
             ground = self._grounds[part]
-            assert isinstance(ground, Ground) and isinstance(ground.shape, Terrain)
+            assert isinstance(ground, Ground)
+            assert isinstance(ground.shape, Terrain)
             for sensor, place in enumerate(self._places[part]):
                 at = _applied(frames[:, sensor].astype(float), middle)
                 seen = _inverse_applied(poses[:, place].astype(float), at)
@@ -385,13 +386,16 @@ class ParallelSensors:
         return np.broadcast_to(given, self.fleet.count)
 
 
-class SensorsByDesign[T: ParallelSensors](Mapping[str, T]):
+Sensors = TypeVar("Sensors", bound=ParallelSensors)
+
+
+class SensorsByDesign(Mapping[str, Sensors]):
     """Sensors of several designs on one robot, by the names of the designs."""
 
-    def __init__(self, parts: Mapping[str, T]) -> None:
+    def __init__(self, parts: Mapping[str, Sensors]) -> None:
         self._parts = dict(parts)
 
-    def __getitem__(self, name: str) -> T:
+    def __getitem__(self, name: str) -> Sensors:
         return self._parts[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -148,7 +148,7 @@ class Record:
             }  # fmt: skip
         if held is not None:
             given |= {"codes": held.code, "measured": held.capacitance, "ages": held.age}
-        for name, (blank, now, kept) in self._rows.items():
+        for name, (_, now, kept) in self._rows.items():
             values = given[name]
             if values is None:  # no matter with losses: as in an empty environment
                 values = np.zeros(now.shape)

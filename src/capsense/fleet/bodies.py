@@ -31,6 +31,14 @@ def on_device(values: Any) -> bool:
     return hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
 
 
+def host_array(values: Any) -> Any:
+    """An array of Warp, PyTorch or JAX as one of NumPy, copied from its device; others as given."""
+    if not on_device(values):
+        return values
+    values = values.cpu() if hasattr(values, "cpu") else values
+    return values.numpy() if hasattr(values, "numpy") else np.asarray(values)
+
+
 _EACH = ("choice", "scale", "inverse_susceptibility", "ground_elastance", "neutral", "slack")
 """What :class:`Bodies` have for every environment."""
 

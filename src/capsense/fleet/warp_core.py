@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from capsense.fleet import warp_cut, warp_fabric, warp_gap, warp_near, warp_slop
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
-from capsense.fleet.bodies import Bodies, chosen_rows, on_device
+from capsense.fleet.bodies import Bodies, on_device
 from capsense.fleet.warp_chips import WarpChips
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
@@ -215,14 +215,12 @@ class WarpCore:
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-    def _marks(self, environments: Any) -> Any:
-        """Marks of the environments to be solved, of numbers or a mask, which may be a device's."""
-        if environments is None:
-            return self.due
-        if not on_device(environments):
-            rows = chosen_rows(environments, self.counts[0])
-            self.some.assign(np.isin(np.arange(self.counts[0]), rows).astype(np.int32))
-            return self.some
+    def mask(self, environments: Any) -> Any:
+        """A mask of environments on the device, as an array of Warp.
+
+        Raises:
+            SceneError: It is of another shape or type, or on another device.
+        """
         mask = environments
         if not isinstance(mask, wp.array):
             mask = wp.from_torch(mask) if hasattr(mask, "is_cuda") else wp.from_dlpack(mask)
@@ -232,7 +230,16 @@ class WarpCore:
                 f"give a mask, bool of shape {self.due.shape}, on {self.device}, or an array of "
                 "NumPy"
             )
-        self.launch(warp_cut.mark, self.counts[0], mask, self.some)
+        return mask
+
+    def marks(self, mask: Any) -> Any:
+        """Marks of the environments that a mask names, of NumPy or of Warp; None for all."""
+        if mask is None:
+            return self.due
+        if isinstance(mask, np.ndarray):
+            self.some.assign(mask.astype(np.int32))
+        else:
+            self.launch(warp_cut.mark, self.counts[0], mask, self.some)
         return self.some
 
     def solve(self, bodies: Any, sensors: Any, forces: Any, environments: Any = None) -> None:
@@ -243,8 +250,8 @@ class WarpCore:
             sensors: The same of the sensors, shape (e, s, 7); None for the frames of the worlds.
             forces: Normal forces that press bodies onto the cover [N], NaN for none, shape (e, b);
                 None for those that they have themselves.
-            environments: Which environments are solved, see :meth:`Fleet.step`; what the others
-                have is left as it is.
+            environments: Mask of the environments that are solved, of NumPy or of Warp, None for
+                all; what the others have is left as it is.
 
         Raises:
             SceneError: They are of another shape or precision, or on another device.
@@ -253,7 +260,7 @@ class WarpCore:
         bodies = as_array("poses", bodies, self.poses)
         sensors = self.worlds if sensors is None else as_array("sensors", sensors, self.frames)
         forces = self.own_forces if forces is None else as_array("forces", forces, self.forces)
-        due = self._marks(environments)
+        due = self.circuit.due = self.marks(environments)
         n, views = self.cut.number.shape
         size = self.whole.shape[0]
         green, cut, circuit = self.green, self.cut, self.circuit
@@ -292,7 +299,7 @@ class WarpCore:
             self.launch(warp_fabric.fabric_change, size, self.gap, self.fabric, self.pressed, whole)
         self.launch(network.eliminate, views, circuit, self.near, rest, whole)
         self.launch(
-            network.report, (circuit.electrodes, views), circuit, whole, due,
+            network.report, (circuit.electrodes, views), circuit, whole,
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
         )  # fmt: skip
 
@@ -428,9 +435,9 @@ class WarpCore:
             warp_fabric.add_slopes, size, self.circuit, fabric, self.cut.moved, found, volts, out
         )
 
-    def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
+    def chips(self, readout: Readout, empty: Array, how: Mapping[str, Any]) -> WarpChips:
         """Chips for all sensors, see :class:`WarpChips`."""
-        return WarpChips(readout, (self.counts[0], self.counts[2]), empty, seed, self.device)
+        return WarpChips(readout, self.counts[0], self.counts[2], empty, self.device, **how)
 
     def launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:
         """Launch a kernel on the device."""

@@ -36,6 +36,7 @@ class Circuit:
     empty_maxwell: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
     empty: wp.array2d(dtype=wp.float64)  # that of the driven ones, the others eliminated, (k, k)
     screened: wp.array2d(dtype=wp.float32)  # bound of what an entry changes by [F], (t, t)
+    due: wp.array(dtype=wp.int32)  # whether an environment is reported, (e,)
 
 
 @wp.kernel
@@ -161,7 +162,7 @@ def _doubt(t: int, nodes: int, i: int, left: Left, whole: wp.array3d(dtype=wp.ve
 
 @wp.kernel
 def report(
-    circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d), due: wp.array(dtype=wp.int32),
+    circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d),
     capacitance: wp.array4d(dtype=wp.float32), delta: wp.array4d(dtype=wp.float32),
     conductance: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
     doubt: wp.array2d(dtype=wp.float32), error: wp.array2d(dtype=wp.float32),
@@ -170,7 +171,7 @@ def report(
     i, v = wp.tid()
     e = v // delta.shape[1]
     s = v % delta.shape[1]
-    if due[e] == 0:
+    if circuit.due[e] == 0:
         return
     for j in range(circuit.electrodes):
         value = whole[i, j, v]

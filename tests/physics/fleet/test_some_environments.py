@@ -13,6 +13,7 @@ COVERED = """
 name = "covered"
 [domain]
 size = [0.2, 0.2, 0.1]
+backplane = 0.01
 [[electrode]]
 name = "E1"
 disc = { radius = 0.01 }
@@ -93,12 +94,50 @@ def test_a_mask_on_the_device():
     where[..., 2], where[..., 6] = 0.03, 1.0
     due = np.array([True, False, True])
     truth = host(fleet.step(where, environments=due).delta)
-    assert (truth[[0, 2]] != 0).any(axis=(1, 2, 3)).all() and not truth[1].any()
+    assert (truth[[0, 2]] != 0).any(axis=(1, 2, 3)).all()
+    assert not truth[1].any()
     for mask in (wp.array(due, dtype=wp.bool, device="cpu"), torch.tensor(due)):
         again = cs.Fleet("patch", [cs.Body(cs.Sphere(0.01))], 3, device="warp:cpu", budget=32)
         np.testing.assert_array_equal(host(again.step(where, environments=mask).delta), truth)
     with pytest.raises(SceneError, match="bool of shape"):
         fleet.step(where, environments=torch.tensor([1, 0, 1]))
+
+
+@pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
+def test_chips_of_others_stand_still(device):
+    """Differential: of two that are due in turn, each holds what a fleet of its own does."""
+    if device != "cpu":
+        pytest.importorskip("warp")
+    ball = [cs.Body(cs.Sphere(0.01))]
+
+    def fleet(count):
+        out = cs.Fleet("patch", ball, count, device=device, budget=32)
+        chip = cs.Readout.preset("ad7147", out.electrode_names, noise=False)
+        out.use_readout(cs.Readout(chip.bank, chip.schedule, chip.law, wiring=chip.wiring))
+        return out
+
+    both, alone = fleet(2), [fleet(1), fleet(1)]
+    where = np.zeros((2, 1, 7))
+    where[..., 6] = 1.0
+    clocks = np.zeros(2)
+    for k in range(6):
+        e = k % 2 if k < 4 else 1
+        where[e, 0, 2] = 0.02 + 0.002 * k
+        clocks[e] += 0.05
+        due = np.arange(2) == e
+        held = both.step(where, time=clocks, environments=due).held
+        truth = alone[e].step(where[e : e + 1], time=clocks[e]).held
+        np.testing.assert_array_equal(host(held.code)[e], host(truth.code)[0])
+        np.testing.assert_allclose(host(held.age)[e], host(truth.age)[0], rtol=1e-9)
+        other = host(held.code)[1 - e], host(held.age)[1 - e]
+        if k:
+            np.testing.assert_array_equal(other, before[1 - e])
+        before = list(zip(host(held.code), host(held.age), strict=True))
+    assert host(held.code).all()
+    both.reset([0])
+    held = both.step(where, time=clocks, environments=[1]).held
+    assert not host(held.code)[0].any()
+    assert np.isinf(host(held.age)[0]).all()
 
 
 def test_refused():
