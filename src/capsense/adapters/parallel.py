@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar, no_type_check
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from capsense._style import signal_colours, strength
 from capsense.adapters.meshes import Terrain
 from capsense.adapters.record import ParallelData, Record
-from capsense.adapters.rules import AttachOptions, Names, Rules
+from capsense.adapters.rules import AttachOptions, Names, Rules, matches
 from capsense.adapters.world import HalfSpace, plate_thickness
 from capsense.design import load_design
 from capsense.design.model import Design
@@ -25,7 +25,8 @@ from capsense.fleet import Fleet
 from capsense.fleet.bodies import chosen_rows, on_device
 from capsense.reading import FleetReading
 from capsense.readout import Readout
-from capsense.scene import Body, Box, Material, Pose, Sphere
+from capsense.readout.randomisation import ReadoutRandomisation
+from capsense.scene import Body, Box, Material, Pose, Shape, Sphere
 from capsense.scene.materials import Grounding
 from capsense.simulator import PresetName
 from capsense.solver.tree.matter import matter_of
@@ -49,7 +50,7 @@ class FleetOptions(AttachOptions, total=False):
     """Accuracy on the CPU and on Warp, as of a fleet."""
     readout: Readout | str | Path | None
     """A readout, a chip's name or a file, of which every sensor has a chip; none by default."""
-    randomisation: Any
+    randomisation: ReadoutRandomisation | None
     """In what chips differ, drawn anew at a reset; see :meth:`Fleet.use_readout`."""
     seed: int | None
     """Of all random numbers of the chips; by default the readout's own."""
@@ -141,7 +142,9 @@ class ParallelSensors:
         self.names = tuple(parts[k].names[-1] for k in self.chosen)
         self.sites = tuple(name for name, _ in sites)
         """Names of the shapes that are seen, and of the sites, in order."""
-        shared, groups, self._share = _connected(seen, self.fleet.excitation_frequency)
+        self.carriers = self.sites
+        """What carries each sensor, by name."""
+        shared, groups = _connected(seen, self.fleet.excitation_frequency)
         for part, bodies in enumerate(shared):
             for place in places[part]:
                 if self._is_terrain(part):
@@ -300,10 +303,14 @@ class ParallelSensors:
         """Places whose shapes have other sizes than before: place, worlds, and new bodies."""
         return ()
 
-    def _change(self, place: int, rows: NDArray[np.integer], bodies: Sequence[Body]) -> None:
-        """Put other bodies in a place of some worlds, with their shares of a capacitance."""
+    def _like(self, place: int, shape: Shape) -> Body:
+        """A body of another shape in a place, of the same matter and rule."""
         part = next(k for k, mine in enumerate(self._places) if place in mine)
-        self.fleet.change(place, _with_share(bodies, self._share[part]), rows)
+        return replace(self._matter[part], shape=shape)
+
+    def _change(self, place: int, rows: NDArray[np.integer], bodies: Sequence[Body]) -> None:
+        """Put other bodies, as of :meth:`_like`, in a place of some worlds."""
+        self.fleet.change(place, bodies, rows)
 
     def _lay_terrain(self, poses: NDArray[Any], frames: NDArray[Any]) -> None:
         """Give each sensor the part of a terrain that it is over."""
@@ -394,6 +401,38 @@ class SensorsByDesign(Mapping[str, Sensors]):
 
     def __init__(self, parts: Mapping[str, Sensors]) -> None:
         self._parts = dict(parts)
+
+    @classmethod
+    def on_carriers(
+        cls, make: Callable[[list[int], Design], Sensors], carriers: Sequence[str], design: Any
+    ) -> SensorsByDesign[Sensors]:
+        """Sensors on the bodies of some names.
+
+        Args:
+            make: Makes those of one design, of the numbers of their carriers.
+            carriers: Names of the bodies, one for each sensor.
+            design: A design for all; or a dict of name patterns and designs, of which the first
+                that fits a body is that of its sensor.
+
+        Raises:
+            SceneError: No pattern fits a body, a pattern fits none, or two designs have one name.
+        """
+        given = design if isinstance(design, Mapping) else {"*": design}
+        groups = patterns_by_design(given)
+        owner = {pattern: name for name, (_, mine) in groups.items() for pattern in mine}
+        numbers: dict[str, list[int]] = defaultdict(list)
+        for k, carrier in enumerate(carriers):
+            name = next((owner[p] for p in given if matches(p, (carrier,))), None)
+            if name is None:
+                raise SceneError(f"no design is given for {carrier!r}; add a pattern that fits it")
+            numbers[name].append(k)
+        for pattern in given:
+            if not any(matches(pattern, (carrier,)) for carrier in carriers):
+                raise SceneError(f"design: no body fits {pattern!r}; there are {list(carriers)}")
+        out = cls({name: make(mine, groups[name][0]) for name, mine in numbers.items()})
+        for name, sensors in out.items():
+            sensors.carriers = tuple(carriers[k] for k in numbers[name])
+        return out
 
     def __getitem__(self, name: str) -> Sensors:
         return self._parts[name]
@@ -486,23 +525,18 @@ def _inverse_applied(poses: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
 
 def _connected(
     parts: Sequence[WorldShape], frequency: float
-) -> tuple[list[Body | Sequence[Body | None]], list[list[int]], list[int]]:
-    """The bodies of parts with their shares of capacitances, and which parts are one conductor.
-
-    And in how many shares the capacitance of each part's rule is divided, 1 where it has none.
-    """
+) -> tuple[list[Body | Sequence[Body | None]], list[list[int]]]:
+    """The bodies of parts with their shares of capacitances, and which parts are one conductor."""
     free = [k for k, part in enumerate(parts) if _is_free(_some_body(part), frequency)]
     count = Counter(parts[k].owner for k in free)
     out: list[Any] = [part.bodies for part in parts]
-    share = [1] * len(parts)
     groups: dict[tuple[int, str], list[int]] = defaultdict(list)
     for k in free:
         tree, owner = parts[k].tree, parts[k].owner
-        share[k] = count[owner]
         out[k] = _with_share(out[k], count[owner])
         if tree >= 0:
             groups[tree, owner].append(k)
-    return out, [group for group in groups.values() if len(group) > 1], share
+    return out, [group for group in groups.values() if len(group) > 1]
 
 
 def _is_free(body: Body, frequency: float) -> bool:
