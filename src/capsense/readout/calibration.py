@@ -227,6 +227,11 @@ class ResponseCurve:
         """
         return partial(_follow, *self.points(context))
 
+    def toml(self) -> str:
+        """The points as the table ``[curve]`` of a readout file."""
+        lines = [f"{key} = {getattr(self, key).tolist()}" for key in ("true", "measured")]
+        return "\n".join(["[curve]", *lines, ""])
+
     def points(self, context: Context) -> tuple[Array, Array]:
         """The points of all channels, true and measured [F], each of shape (channels, P).
 

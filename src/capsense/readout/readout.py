@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -100,13 +101,23 @@ class Readout:
         self.reset(seed=seed)
 
     @classmethod
-    def preset(cls, chip: str, electrodes: Sequence[str], **options: Any) -> Readout:
+    def preset(cls, chip: str | Path, electrodes: Sequence[str], **options: Any) -> Readout:
         """A readout with the figures of a known chip; see :func:`build`.
 
+        Args:
+            chip: Its name, or the path of a readout file (``.toml``).
+            electrodes: Electrode names in matrix order.
+            **options: Those of :class:`~capsense.readout.presets.ReadoutOptions`; they go before
+                what a file says, and stages before those of the file.
+
         Raises:
-            ReadoutError: No such chip, or an option is wrong.
+            ReadoutError: No such chip or file, the file is wrong, or an option is.
         """
-        return build(chip, electrodes, ReadoutOptions.of(options))
+        if str(chip).endswith(".toml"):
+            from capsense.readout.config import load_readout  # which imports this module
+
+            return load_readout(chip, electrodes, **options)
+        return build(str(chip), electrodes, ReadoutOptions.of(options))
 
     def __repr__(self) -> str:
         return (

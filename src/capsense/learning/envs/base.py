@@ -26,6 +26,8 @@ from capsense.learning.envs.signals import LIMIT, Signals
 from capsense.reading import Reading
 from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor
+from capsense.readout.config import make_readout
+from capsense.readout.noise import RandomWalk
 from capsense.readout.presets import chip_of
 from capsense.scene import Material, Pose
 from capsense.simulator import PresetName, Simulator
@@ -69,18 +71,29 @@ class Drawn:
         sex = "female" if self.female > 0.5 else "male"
         return Build(sex, percentile=self.percentile, girth=self.girth)  # type: ignore[arg-type]
 
-    def readout(self, chip: str, electrodes: tuple[str, ...], rng: Generator) -> Readout:
-        """The readout of one sensor, at the chip's highest rate, with a gain of its own.
+    def readout(self, chip: Readout | str | Path, sensor: Simulator, rng: Generator) -> Readout:
+        """The readout of one sensor, with a gain of its own.
+
+        A chip by its name has its highest rate, and the noise that was drawn. A file or a readout
+        keeps its rate and its noise; gain, drift and latency come on top.
 
         Raises:
-            ReadoutError: There is no such chip.
+            ReadoutError: There is no such chip or file, or the file is wrong.
         """
-        rate = max(r.per_second for r in chip_of(chip).rates)
         gain = 1.0 + self.gain * rng.uniform(-1.0, 1.0)
         stage = LinearSensor(np.array(gain), np.array(0.0), np.array(0.0), 0.0)
-        return Readout.preset(
-            chip, electrodes, rate=rate, latency=self.latency, white=self.noise,
-            walk=self.drift, stages=(stage,),
+        if isinstance(chip, str) and not chip.endswith(".toml"):
+            rate = max(r.per_second for r in chip_of(chip).rates)
+            return Readout.preset(
+                chip, sensor.electrode_names, rate=rate, latency=self.latency, white=self.noise,
+                walk=self.drift, stages=(stage,),
+            )  # fmt: skip
+        own = make_readout(chip, sensor)
+        walk = (RandomWalk(self.drift),) if self.drift else ()
+        plan = dataclasses.replace(own.schedule, latency=own.schedule.latency + self.latency)
+        return Readout(
+            own.bank, plan, own.law, dac=own.dac, wiring=own.wiring, detector=own.detector,
+            stages=(stage, *own.stages, *walk), seed=own.seed,
         )  # fmt: skip
 
 
@@ -169,13 +182,13 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
 
     Args:
         randomisation: What episodes draw from, or some of its ranges by name.
-        chip: Name of the chip behind every sensor.
+        chip: Name of the chip behind every sensor, a readout file, or a readout.
         preset: How finely the solver resolves surfaces.
         design: Sensor design, instead of the task's own; or a simulator, whose field is shared.
 
     Raises:
         SceneError: A range of the randomisation is wrong.
-        ReadoutError: There is no such chip.
+        ReadoutError: There is no such chip or file, or the file is wrong.
         DesignError: The design is wrong.
     """
 
@@ -196,7 +209,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     def __init__(
         self,
         randomisation: Randomisation | Mapping[str, Sequence[float]] | None = None,
-        chip: str = "fdc1004",
+        chip: Readout | str | Path = "fdc1004",
         preset: PresetName = "fast",
         design: AnyDesign | None = None,
     ) -> None:
@@ -338,9 +351,8 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         self._move_limb(self.limb_pose(0.0))
         self.start()
         mujoco.mj_forward(self.model, self.data)
-        names = self.simulator.electrode_names
         self.signals = Signals(
-            {site: self.drawn.readout(self._chip, names, rng) for site in self.sites}
+            {site: self.drawn.readout(self._chip, self.simulator, rng) for site in self.sites}
         )
 
     def make_limb(self) -> Limb:

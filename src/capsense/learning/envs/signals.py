@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -118,7 +119,8 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         env: An environment with ``unwrapped.model`` and ``unwrapped.data`` of MuJoCo.
         sites: Sites that carry sensors; see :func:`write_model` where there are none.
         design: What :func:`capsense.adapters.mujoco.attach_skin` takes.
-        readout: Name of the chip behind every sensor, or a readout file.
+        readout: Name of the chip behind every sensor, a readout file, or a readout, of which every
+            sensor has a copy.
         options: As for ``attach_skin``: ``materials``, ``grounding``, ``exclude`` and so on.
 
     Raises:
@@ -133,7 +135,7 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         env: gymnasium.Env[Any, Any],
         sites: Sequence[str],
         design: AnyDesign = DEFAULT_DESIGN,
-        readout: str | Path = "fdc1004",
+        readout: Readout | str | Path = "fdc1004",
         **options: Any,
     ) -> None:
         how = {"sites": sites, "design": design, "readout": readout, **options}
@@ -183,7 +185,9 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         readout = how.pop("readout")
         self.skin = adapter.attach_skin(inner.model, inner.data, **how, threads=1)
         sensors = {} if readout is None else self.skin.sensors
-        self.signals = Signals({n: make_readout(readout, s.simulator) for n, s in sensors.items()})
+        self.signals = Signals(
+            {n: copy.deepcopy(make_readout(readout, s.simulator)) for n, s in sensors.items()}
+        )
 
 
 def write_model(env_id: str, body: str, pose: Pose, path: str | Path, name: str = "pad") -> str:

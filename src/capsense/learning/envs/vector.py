@@ -143,7 +143,7 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     Raises:
         ValueError: ``num_envs`` is not a whole number from 1.
         SceneError: An option is wrong.
-        ReadoutError: There is no such chip.
+        ReadoutError: There is no such chip or file, or the file is wrong.
         DesignError: The design is wrong.
     """
 
