@@ -54,8 +54,9 @@ class CapacitiveSensor(SensorBase):
         self.newton_sensors: SensorsByDesign[SensorCapacitance] | None = None
         super().__init__(cfg)
         warn_experimental("the sensor of Isaac Lab", "a stand-in and a real model of Newton")
+        register = _method("register_site")
         self._labels = [
-            NewtonManager.register_site(cfg.prim_path, wp.transform(position, turn))
+            register(self.cfg.prim_path, wp.transform(position, turn))
             for position, turn in cfg.offsets
         ]
 
@@ -102,7 +103,7 @@ class CapacitiveSensor(SensorBase):
             raise SceneError("a capacitive sensor needs Isaac Lab's Newton backend")
         # in double precision, which the timestamps of the base class have not
         self._clock = torch.zeros(self._num_envs, dtype=torch.float64, device=self.device)
-        sites = NewtonManager.get_site_index_map()
+        sites = _method("get_site_index_map")()
         numbers = [k for label in self._labels for k in self._of_first(*sites[label])]
         bodies, options = model.shape_body.numpy(), dict(self.cfg.options)
         options["history_length"] = self.cfg.history_length
@@ -167,6 +168,11 @@ class CapacitiveSensor(SensorBase):
     def _invalidate_initialize_callback(self, event: Any) -> None:
         super()._invalidate_initialize_callback(event)
         self.newton_sensors = None
+
+
+def _method(name: str) -> Any:
+    """A method of the manager, which has a prefix in some versions of Isaac Lab 3."""
+    return getattr(NewtonManager, name, None) or getattr(NewtonManager, f"cl_{name}")
 
 
 def _shade(colours: Any) -> Any:

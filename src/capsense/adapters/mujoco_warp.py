@@ -99,7 +99,7 @@ class CapacitiveSensors(ParallelSensors):
             root = int(model.body_rootid[own])
             link, tree = (number if number > 0 else -1 for number in (own, root))
             parts.append(WorldShape((solid.label,), link, tree, solid.tie.owner, body))
-        numbers = _sites(model, [sites] if isinstance(sites, str) else list(sites))
+        numbers = find_sites(model, [sites] if isinstance(sites, str) else sites)
         carriers = [(model.site(k).name, int(model.site_bodyid[k])) for k in numbers]
         device = data.geom_xpos.device
         super().__init__(
@@ -197,7 +197,7 @@ def mujoco_kind(model: mujoco.MjModel, geom: int) -> str:
     return mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_")
 
 
-def _sites(model: mujoco.MjModel, patterns: Sequence[str]) -> list[int]:
+def find_sites(model: mujoco.MjModel, patterns: Sequence[str]) -> list[int]:
     """Numbers of the sites of some names or name patterns.
 
     Raises:

@@ -29,7 +29,6 @@ from capsense.reading import FleetReading
 from capsense.scene import Body, Shape
 from capsense.simulator import DEFAULT_DESIGN
 
-
 _BASE = 0.1
 """Depth of the floor of a height field below its lowest point, over its half width."""
 

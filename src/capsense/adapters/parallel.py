@@ -233,6 +233,14 @@ class ParallelSensors:
         """
         self._looked = False
 
+    def frames(self) -> NDArray[np.float64]:
+        """Where the sensors were at the last reading: position [m], then quaternion (x, y, z, w).
+
+        Returns:
+            Shape (worlds, sensors, 7).
+        """
+        return np.asarray(self._frames.numpy(), float)
+
     def electrode_lines(
         self, environments: ArrayLike | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -255,7 +263,7 @@ class ParallelSensors:
             owner = np.repeat(np.arange(len(rims)), [len(r) for r in rims])
             self._segments = np.concatenate(rims), owner
         segments, owner = self._segments
-        frames = self._frames.numpy().astype(float)[rows][:, :, None, None]
+        frames = self.frames()[rows][:, :, None, None]
         axis, w = frames[..., 3:6], frames[..., 6:]
         turn = 2.0 * np.cross(axis, segments)
         ends = frames[..., :3] + segments + w * turn + np.cross(axis, turn)
