@@ -5,8 +5,8 @@ The names, arguments and the order of calls are those of ``isaaclab.sensors.Sens
 3.0, as its repository has them in autumn 2026: timestamps in single precision and masks of what is
 outdated for each environment; ``reset`` clears the mask, so that data are read anew after the next
 ``update`` only; ``update`` reads at once while it draws. The manager's methods for sites have the
-prefix ``cl_`` in some versions. Behind the manager is a real Newton model. Configuration classes are
-plain dataclasses here.
+prefix ``cl_`` in some versions. Behind the manager is a real Newton model. Configuration classes
+are plain dataclasses here.
 """
 
 from __future__ import annotations

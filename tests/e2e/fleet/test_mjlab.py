@@ -103,7 +103,7 @@ def test_a_scene_steps():
     # sizes that are drawn for each world
     sim.expand_model_fields(("geom_size",))
     scene.initialize(sim.mj_model, sim.model, sim.data)
-    arm = [k for k in range(model.ngeom) if model.geom(k).name == "arm/forearm"][0]
+    arm = model.geom("arm/forearm").id
     near = scene["skin"].data.delta[:, 0, 0, 0].clone()
     sim.model.geom_size[1, arm, 0] = 0.02
     scene["skin"].reset(torch.tensor([1]))
