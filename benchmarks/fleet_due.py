@@ -1,6 +1,6 @@
 """What a step of some environments of a fleet costs, over one of all.
 
-    python benchmarks/fleet_due.py [--device cpu] [--count 1024]
+python benchmarks/fleet_due.py [--device cpu] [--count 1024]
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ def main() -> None:
     given = parser.parse_args()
     rng = np.random.default_rng(0)
     bodies = [cs.Body(cs.Capsule(0.01, 0.05), material="human"), cs.Body(cs.Box((0.1, 0.1, 0.02)))]
-    fleet = cs.Fleet("six_patch", bodies, given.count, device=given.device, preset="fast", budget=32)
+    fleet = cs.Fleet(
+        "six_patch", bodies, given.count, device=given.device, preset="fast", budget=32
+    )
     poses = np.zeros((given.count, 2, 7))
     poses[..., 6] = 1.0
     poses[:, 0, :3] = rng.uniform([-0.05, -0.05, 0.03], [0.05, 0.05, 0.1], (given.count, 3))

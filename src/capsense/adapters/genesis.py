@@ -19,8 +19,9 @@ from genesis.options.sensors.options import RigidSensorOptionsMixin, SimpleSenso
 from genesis.utils.geom import euler_to_quat
 
 from capsense._style import signal_colours, strength
+from capsense.adapters.grounds import Ground
 from capsense.adapters.meshes import Terrain, primitive, solid_mesh, terrain_shape
-from capsense.adapters.parallel import FleetOptions, Ground, ParallelSensors, WorldShape
+from capsense.adapters.parallel import FleetOptions, ParallelSensors, WorldShape
 from capsense.adapters.rules import Rules, matches, split_rules
 from capsense.adapters.world import HalfSpace
 from capsense.design import load_design

@@ -10,12 +10,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from capsense.adapters.grounds import Ground
 from capsense.adapters.meshes import primitive
 from capsense.adapters.mujoco_depth import find_site
 from capsense.adapters.mujoco_model import ModelReader
 from capsense.adapters.parallel import (
     FleetOptions,
-    Ground,
     ParallelSensors,
     WorldShape,
     as_numbers,

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from capsense.adapters.grounds import Ground
 from capsense.adapters.meshes import primitive, solid_mesh, terrain_shape
 from capsense.adapters.parallel import (
     FleetOptions,
-    Ground,
     ParallelSensors,
     WorldShape,
     matching,

@@ -14,10 +14,10 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._style import signal_colours, strength
+from capsense.adapters.grounds import Ground, TerrainParts
 from capsense.adapters.meshes import Terrain
 from capsense.adapters.record import ParallelData, Record
 from capsense.adapters.rules import AttachOptions, Names, Rules, matches
-from capsense.adapters.world import HalfSpace, plate_thickness
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
@@ -26,8 +26,7 @@ from capsense.fleet.bodies import chosen_rows, on_device
 from capsense.reading import FleetReading
 from capsense.readout import Readout
 from capsense.readout.randomisation import ReadoutRandomisation
-from capsense.scene import Body, Box, Material, Pose, Shape, Sphere
-from capsense.scene.materials import Grounding
+from capsense.scene import Body, Shape
 from capsense.simulator import PresetName
 from capsense.solver.tree.matter import matter_of
 
@@ -36,8 +35,6 @@ Fixed = tuple[NDArray[np.integer], NDArray[np.floating]]
 w), shapes (worlds, n) and (worlds, n, 7)."""
 _SHOWN = 6
 """Names that are listed in a message."""
-_ENDLESS = 1e4
-"""Width of the plate that stands for a half space [m]; a fleet uses what is near the sensor."""
 
 
 class FleetOptions(AttachOptions, total=False):
@@ -56,15 +53,6 @@ class FleetOptions(AttachOptions, total=False):
     """Of all random numbers of the chips; by default the readout's own."""
     history_length: int
     """How many readings of each world are kept in ``data.history``; none by default."""
-
-
-@dataclass(frozen=True)
-class Ground:
-    """Matter that goes on below a face, such as a floor or a terrain."""
-
-    shape: HalfSpace | Terrain
-    material: Material
-    grounding: Grounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +111,15 @@ class ParallelSensors:
         if not kept:
             raise SceneError("there is nothing to see: all shapes are left out")
         length = _whole("history_length", options.get("history_length", 0))
-        self._grounds = [parts[k].bodies for k in kept]
-        seen = [replace(parts[k], bodies=self._standing(parts[k].bodies)) for k in kept]
+        grounds = [parts[k].bodies if isinstance(parts[k].bodies, Ground) else None for k in kept]
+        domain = self.design.domain
+        seen = [
+            parts[k] if ground is None else replace(parts[k], bodies=ground.body(domain))
+            for k, ground in zip(kept, grounds, strict=True)
+        ]
         first = [_some_body(part) for part in seen]
         count = len(sites)
-        places = self._places = _numbered(self._grounds, count)
+        places = self._places = _numbered(grounds, count)
         """Numbers of the places of each part that is seen; of a terrain one for each sensor."""
         self.chosen = [k for k, mine in zip(kept, places, strict=True) for _ in mine]
         """Which of the parts stands in each place."""
@@ -147,7 +139,7 @@ class ParallelSensors:
         shared, groups = _connected(seen, self.fleet.excitation_frequency)
         for part, bodies in enumerate(shared):
             for place in places[part]:
-                if self._is_terrain(part):
+                if _is_terrain(grounds[part]):
                     self.fleet.change(place, None)
                 elif bodies is not first[part]:
                     self.fleet.change(place, bodies)
@@ -159,18 +151,22 @@ class ParallelSensors:
                 for part, mine in enumerate(places)
                 for k, place in enumerate(mine)
                 if (rules.exclude_own and seen[part].body == own >= 0)
-                or (self._is_terrain(part) and k != sensor)
+                or (_is_terrain(grounds[part]) and k != sensor)
             ]
             self.fleet.hide(sensor, hidden)
         self._matter = [_some_body(replace(seen[k], bodies=shared[k])) for k in range(len(seen))]
-        self._tiles = {
-            part: np.full((worlds, count, 2), -1)
-            for part in range(len(seen)) if self._is_terrain(part)
-        }  # fmt: skip
-        self._known_tiles: dict[tuple[int, int, int], Body] = {}
+        self.terrains = [
+            TerrainParts(ground.shape, self._matter[part], places[part], worlds, domain)
+            for part, ground in enumerate(grounds)
+            if ground is not None and isinstance(ground.shape, Terrain)
+        ]
+        """The parts of terrains that sensors are over."""
         self._poses = wp.zeros((worlds, len(self.chosen)), dtype=wp.transform, device=device)
         self._frames = wp.zeros((worlds, count), dtype=wp.transform, device=device)
-        drops = [self._drop(part) for part, mine in enumerate(places) for _ in mine]
+        drops = [
+            0.0 if ground is None else ground.drop(domain)
+            for ground, mine in zip(grounds, places, strict=True) for _ in mine
+        ]  # fmt: skip
         self._drops = wp.array(drops, dtype=wp.float32, device=device) if any(drops) else None
         self._looked = False
         if options.get("readout") is not None:
@@ -273,26 +269,6 @@ class ParallelSensors:
         points = ends.reshape(-1, 2, 3)
         return points[:, 0], points[:, 1], colours.reshape(-1, 3)
 
-    def _is_terrain(self, part: int) -> bool:
-        ground = self._grounds[part]
-        return isinstance(ground, Ground) and isinstance(ground.shape, Terrain)
-
-    def _standing(self, bodies: Any) -> Any:
-        """Bodies as they are; for matter that goes on a plate, or what a terrain is made of."""
-        if not isinstance(bodies, Ground):
-            return bodies
-        plate = plate_thickness(self.design.domain, bodies.material)
-        flat = isinstance(bodies.shape, HalfSpace)
-        shape = Box((_ENDLESS, _ENDLESS, plate)) if flat else Sphere(0.01)
-        return Body(shape, Pose(), bodies.material, bodies.grounding)
-
-    def _drop(self, part: int) -> float:
-        """How far the middle of what stands in a part's places is below its frame [m]."""
-        ground = self._grounds[part]
-        if isinstance(ground, Ground) and isinstance(ground.shape, HalfSpace):
-            return 0.5 * plate_thickness(self.design.domain, ground.material)
-        return 0.0
-
     def _fix(self, places: Fixed, sites: Fixed) -> None:
         """Say where the shapes that are seen, and the sites, are on the simulator's bodies."""
         device = self._poses.device
@@ -319,29 +295,6 @@ class ParallelSensors:
     def _change(self, place: int, rows: NDArray[np.integer], bodies: Sequence[Body]) -> None:
         """Put other bodies, as of :meth:`_like`, in a place of some worlds."""
         self.fleet.change(place, bodies, rows)
-
-    def _lay_terrain(self, poses: NDArray[Any], frames: NDArray[Any]) -> None:
-        """Give each sensor the part of a terrain that it is over."""
-        middle = self.design.domain.sight.mean(axis=0)
-        reach = 0.5 * max(self.design.domain.size)
-        for part, before in self._tiles.items():
-            ground = self._grounds[part]
-            assert isinstance(ground, Ground)
-            assert isinstance(ground.shape, Terrain)
-            for sensor, place in enumerate(self._places[part]):
-                at = _applied(frames[:, sensor].astype(float), middle)
-                seen = _inverse_applied(poses[:, place].astype(float), at)
-                now = ground.shape.tiles(seen)
-                moved = np.flatnonzero((now != before[:, sensor]).any(axis=1))
-                before[:, sensor] = now
-                alike, which = np.unique(now[moved], axis=0, return_inverse=True)
-                for k, (x, y) in enumerate(alike.tolist()):
-                    rows = moved[which.reshape(-1) == k]
-                    if (part, x, y) not in self._known_tiles:
-                        shape = ground.shape.near(seen[rows[0]], reach)
-                        body = replace(self._matter[part], shape=shape)
-                        self._known_tiles[part, x, y] = body
-                    self.fleet.change(place, self._known_tiles[part, x, y], rows)
 
     def _mask(self, environments: Any) -> Any:
         """A mask of worlds on the simulator's device, of numbers or a mask; None for all."""
@@ -378,8 +331,9 @@ class ParallelSensors:
                 self._change(*change)
             self._looked = True
         poses, frames, fleet = self._poses, self._frames, self.fleet
-        if self._tiles:
-            self._lay_terrain(poses.numpy(), frames.numpy())
+        for terrain in self.terrains:
+            for place, body, rows in terrain.moved(poses.numpy(), frames.numpy()):
+                fleet.change(place, body, rows)
         clock = time
         if on_device(time) and fleet.device == "cpu":
             clock = _host(time)
@@ -498,12 +452,16 @@ def _whole(what: str, value: object) -> int:
     return int(value)
 
 
-def _numbered(grounds: Sequence[Any], sensors: int) -> list[list[int]]:
+def _is_terrain(ground: Ground | None) -> bool:
+    return ground is not None and ground.is_terrain
+
+
+def _numbered(grounds: Sequence[Ground | None], sensors: int) -> list[list[int]]:
     """Numbers of the places of each part: one, or of a terrain one for each sensor."""
-    out, first = [], 0
+    out: list[list[int]] = []
+    first = 0
     for ground in grounds:
-        terrain = isinstance(ground, Ground) and isinstance(ground.shape, Terrain)
-        count = sensors if terrain else 1
+        count = sensors if _is_terrain(ground) else 1
         out.append(list(range(first, first + count)))
         first += count
     return out
@@ -512,23 +470,6 @@ def _numbered(grounds: Sequence[Any], sensors: int) -> list[list[int]]:
 def _host(values: Any) -> Any:
     """An array on a device as one of NumPy."""
     return values.numpy() if isinstance(values, wp.array) else values.numpy(force=True)
-
-
-def _applied(poses: NDArray[Any], point: NDArray[Any]) -> NDArray[Any]:
-    """A point (3,) of frames with some poses (n, 7) in the world's, shape (n, 3)."""
-    axis, w = poses[:, 3:6], poses[:, 6:]
-    turn = 2.0 * np.cross(axis, point)
-    moved: NDArray[Any] = poses[:, :3] + point + w * turn + np.cross(axis, turn)
-    return moved
-
-
-def _inverse_applied(poses: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
-    """Points (n, 3) of the world's frame in frames with some poses (n, 7)."""
-    off = points - poses[:, :3]
-    axis, w = -poses[:, 3:6], poses[:, 6:]
-    turn = 2.0 * np.cross(axis, off)
-    moved: NDArray[Any] = off + w * turn + np.cross(axis, turn)
-    return moved
 
 
 def _connected(

@@ -253,3 +253,81 @@ def test_refused(stack):
         sensors.reset([5])
     with pytest.raises(SceneError, match="numbers from 0 to 2"):
         sensors.electrode_lines([3])
+
+
+HILLS = """<mujoco><asset>
+ <hfield name="hills" nrow="13" ncol="17" size=".8 .6 .2 .1"/></asset><worldbody>
+ <geom name="hills" type="hfield" hfield="hills" pos=".1 0 0"/>
+ <body name="robot" pos="0 0 .3"><freejoint/>
+  <geom name="link" type="sphere" size=".01" pos="0 0 .1"/>
+  <site name="left" pos="0 .03 0" euler="180 0 0"/>
+  <site name="right" pos="0 -.03 0" euler="180 0 0"/>
+ </body></worldbody></mujoco>"""
+PLACES = np.array([[0.0, 0.0, 0.28], [0.45, -0.2, 0.26], [-0.4, 0.25, 0.27]])
+
+
+def hills():
+    """Heights from 0 to 1 of 13 rows along y and 17 columns along x."""
+    x, y = np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 13))
+    return (0.5 + 0.5 * np.cos(3 * x + 1) * np.cos(2 * y)).astype(np.float32)
+
+
+def attached(model, places):
+    """Readings of both sensors at some places, one by one, shape (places, 2, n, n)."""
+    import mujoco
+
+    data, out = mujoco.MjData(model), []
+    for place in places:
+        data.qpos[:3] = place
+        mujoco.mj_forward(model, data)
+        sensors = [
+            cs.mujoco.attach(model, data, site, cs.Simulator("patch")) for site in ("left", "right")
+        ]
+        out.append([sensor.read().delta for sensor in sensors])
+    return np.array(out)
+
+
+def test_terrains():
+    """Differential: against attached sensors, over tiles that differ, and after a walk."""
+    mujoco, mjw = pytest.importorskip("mujoco"), pytest.importorskip("mujoco_warp")
+    newton = pytest.importorskip("newton")
+    from capsense.adapters.mujoco_warp import CapacitiveSensors
+    from capsense.adapters.newton import SensorCapacitance
+
+    model = mujoco.MjModel.from_xml_string(HILLS)
+    model.hfield_data[:] = hills().ravel()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    state = mjw.put_data(model, data, nworld=WORLDS)
+    there = mjw.put_model(model)
+    sensors = CapacitiveSensors(model, state, ["left", "right"])
+    assert sensors.names == ("hills", "hills")
+
+    builder, still = newton.ModelBuilder(), wp.quat_identity()
+    world, down = newton.ModelBuilder(), wp.quat(1.0, 0.0, 0.0, 0.0)
+    robot = world.add_body(label="robot")
+    world.add_shape_sphere(
+        robot, xform=wp.transform((0.0, 0.0, 0.1), still), radius=0.01, label="link"
+    )
+    for name, y in (("left", 0.03), ("right", -0.03)):
+        world.add_site(robot, xform=wp.transform((0.0, y, 0.0), down), label=name)
+    builder.replicate(world, WORLDS)
+    field = newton.Heightfield(hills(), 13, 17, 0.8, 0.6, min_z=0.0, max_z=0.2 * hills().max())
+    field_at = wp.transform((0.1, 0.0, 0.0), still)
+    builder.add_shape_heightfield(heightfield=field, xform=field_at, label="hills")
+    whole = builder.finalize(device="cpu")
+    same, bodies = SensorCapacitance(whole, ["*left", "*right"]), whole.state()
+
+    for places in (PLACES, PLACES[[1, 2, 0]]):
+        truth = attached(model, places)
+        states = state.qpos.numpy()
+        states[:, :3] = places
+        wp.copy(state.qpos, wp.array(states, dtype=wp.float32, device="cpu"))
+        mjw.kinematics(there, state)
+        poses = np.tile(np.array([0, 0, 0, 0, 0, 0, 1.0], np.float32), (WORLDS, 1))
+        poses[:, :3] = places
+        wp.copy(bodies.body_q, wp.array(poses, dtype=wp.transform, device="cpu"))
+        for found in (sensors.read(state).delta, same.read(bodies).delta):
+            off = np.abs(found - truth).max(axis=(2, 3))
+            assert (off < 2e-3 * np.abs(truth).max(axis=(2, 3))).all()
+    assert len(sensors.terrains[0].known) == 3
