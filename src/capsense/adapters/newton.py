@@ -259,7 +259,7 @@ class _Reader:
         if made is not None:
             return made
         if kind == int(self._kinds.HFIELD):
-            return self._terrain(shape, label)  # type: ignore[no-any-return]
+            return self._terrain(shape, label)
         mesh = self._source[shape]
         vertices = np.asarray(mesh.vertices, float) * np.array(size)
         faces = np.asarray(mesh.indices).reshape(-1, 3)

@@ -70,6 +70,11 @@ class WorldShape:
     bodies: Body | Sequence[Body | None] | Ground
     """What it is: one for all worlds, or one for each, None where there is none."""
 
+    @property
+    def ground(self) -> Ground | None:
+        """The matter that goes on below a face, if it is that."""
+        return self.bodies if isinstance(self.bodies, Ground) else None
+
 
 class ParallelSensors:
     """Sensors of one design on several sites of a robot, in all worlds of a simulator.
@@ -111,7 +116,7 @@ class ParallelSensors:
         if not kept:
             raise SceneError("there is nothing to see: all shapes are left out")
         length = _whole("history_length", options.get("history_length", 0))
-        grounds = [parts[k].bodies if isinstance(parts[k].bodies, Ground) else None for k in kept]
+        grounds = [parts[k].ground for k in kept]
         domain = self.design.domain
         seen = [
             parts[k] if ground is None else replace(parts[k], bodies=ground.body(domain))
@@ -193,8 +198,9 @@ class ParallelSensors:
         Raises:
             SceneError: Two designs have one name; or as by the class.
         """
+        make: Any = cls
         return SensorsByDesign({
-            name: cls(*source, sites, design, **options)
+            name: make(*source, sites, design, **options)
             for name, (design, sites) in patterns_by_design(designs).items()
         })  # fmt: skip
 
