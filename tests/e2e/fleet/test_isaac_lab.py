@@ -205,3 +205,26 @@ def test_refused(lab):
     with pytest.raises(AttributeError):
         sensor._initialize_callback(None)  # the stub counts environments on the model
     manager.model = model
+
+
+def test_example_of_the_page(lab):
+    """Known values: it runs as it is, with a scene that starts its sensor."""
+    from pathlib import Path
+
+    module, manager = lab
+    page = (Path(__file__).parents[3] / "docs" / "fleets.md").read_text()
+    example = page.partition("\nIsaac Lab 3, on its")[2].partition("```py\n")[2].partition("```")[0]
+
+    class Scenes:
+        def __getitem__(self, name):
+            cfg = getattr(names["SceneCfg"], name)
+            sensor = cfg.class_type(cfg)
+            start(manager, bodies=("robot", "arm"))
+            sensor._initialize_callback(None)
+            sensor.update(0.02)
+            return sensor
+
+    names = {"configclass": lambda cls: cls, "InteractiveSceneCfg": object, "scene": Scenes()}
+    exec(example + "\nfound = scene['skin'].data", names)
+    assert names["found"].delta.shape == (ENVS, 2, 6, 6)
+    assert names["found"].codes.shape == (ENVS, 2, 6)

@@ -112,13 +112,10 @@ def stack(request):
     return request.param()
 
 
-def made(stack, sites="skin_*", design="patch", **options):
-    given = {"materials": {"forearm": "human", "*/forearm": "human"}, **stack.options, **options}
-    if not isinstance(stack, OnMujoco):
-        sites, given["materials"] = f"*{sites}", {"*forearm": "human"}
-    else:
-        given["materials"] = {"forearm": "human"}
-    return stack.kind(*stack.source, sites, design, **given)
+def made(stack, sites="skin_*", design="patch", material="human", **options):
+    given = {"materials": {"*forearm": material}, **stack.options, **options}
+    star = "" if isinstance(stack, OnMujoco) else "*"
+    return stack.kind(*stack.source, star + sites, design, **given)
 
 
 def truth(radius, height, x=0.0, design="patch"):
@@ -189,7 +186,7 @@ def test_conductance_and_touch(stack):
     from capsense.design import load_design
 
     wet = cs.Material("wet", 30.0, 1e-4)
-    sensors = made(stack, "skin_a", load_design(FOAM), default_material=wet)
+    sensors = made(stack, "skin_a", load_design(FOAM), wet)
     stack.move([0.5319, 0.54, 0.57])
     sensors.read(stack.state)
     data = sensors.data
@@ -223,10 +220,9 @@ def test_electrodes_are_drawn(stack):
 def test_sites_of_several_designs(stack):
     """Differential: as one object for each design."""
     star = "" if isinstance(stack, OnMujoco) else "*"
-    material = {"forearm": "human"} if isinstance(stack, OnMujoco) else {"*forearm": "human"}
     both = stack.kind.by_design(
         *stack.source, designs={f"{star}skin_*": "patch", f"{star}palm": "six_patch"},
-        materials=material, **stack.options,
+        materials={"*forearm": "human"}, **stack.options,
     )  # fmt: skip
     found = both.read(stack.state)
     assert list(found) == list(both) == ["patch", "six_patch"]
@@ -331,3 +327,25 @@ def test_terrains():
             off = np.abs(found - truth).max(axis=(2, 3))
             assert (off < 2e-3 * np.abs(truth).max(axis=(2, 3))).all()
     assert len(sensors.terrains[0].known) == 3
+
+
+def example_of(heading):
+    """The example on the page about fleets that follows a line with that beginning."""
+    page = (Path(__file__).parents[3] / "docs" / "fleets.md").read_text()
+    return page.partition(f"\n{heading}")[2].partition("```py\n")[2].partition("```")[0]
+
+
+def test_examples_of_the_page(stack):
+    """Known values: those of MuJoCo Warp and Newton run as they are, but for the physics."""
+    from types import SimpleNamespace
+
+    heading = "MuJoCo Warp (`" if isinstance(stack, OnMujoco) else "Newton (`"
+    names = {"model": stack.model, "data": stack.state, "state": stack.state}
+    if isinstance(stack, OnMujoco):
+        names["mujoco_warp"] = SimpleNamespace(step=lambda model, data: None)
+        names["warp_model"] = stack.there
+        wp.copy(stack.state.time, wp.array([0.1] * WORLDS, dtype=float, device="cpu"))
+    else:
+        names["viewer"] = stack.viewer()
+    exec(example_of(heading), names)
+    assert names["codes"].shape == (WORLDS, 2, 6)
