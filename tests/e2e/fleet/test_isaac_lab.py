@@ -211,7 +211,7 @@ def test_example_of_the_page(lab):
     """Known values: it runs as it is, with a scene that starts its sensor."""
     from pathlib import Path
 
-    module, manager = lab
+    _, manager = lab
     page = (Path(__file__).parents[3] / "docs" / "fleets.md").read_text()
     example = page.partition("\nIsaac Lab 3, on its")[2].partition("```py\n")[2].partition("```")[0]
 
