@@ -297,7 +297,7 @@ def test_terrains():
     state = mjw.put_data(model, data, nworld=WORLDS)
     there = mjw.put_model(model)
     sensors = CapacitiveSensors(model, state, ["left", "right"])
-    assert sensors.names == ("hills", "hills")
+    assert sensors.names == ("world/hills", "world/hills", "robot/link")
 
     builder, still = newton.ModelBuilder(), wp.quat_identity()
     world, down = newton.ModelBuilder(), wp.quat(1.0, 0.0, 0.0, 0.0)
