@@ -259,7 +259,7 @@ HILLS = """<mujoco><asset>
   <site name="left" pos="0 .03 0" euler="180 0 0"/>
   <site name="right" pos="0 -.03 0" euler="180 0 0"/>
  </body></worldbody></mujoco>"""
-PLACES = np.array([[0.0, 0.0, 0.28], [0.45, -0.2, 0.26], [-0.4, 0.25, 0.27]])
+PLACES = np.array([[0.0, 0.0, 0.28], [0.45, -0.2, 0.26], [-0.38, 0.22, 0.27]])
 
 
 def hills():
@@ -296,7 +296,7 @@ def test_terrains():
     mujoco.mj_forward(model, data)
     state = mjw.put_data(model, data, nworld=WORLDS)
     there = mjw.put_model(model)
-    sensors = CapacitiveSensors(model, state, ["left", "right"])
+    sensors = CapacitiveSensors(model, state, ["left", "right"], "patch")
     assert sensors.names == ("world/hills", "world/hills", "robot/link")
 
     builder, still = newton.ModelBuilder(), wp.quat_identity()
@@ -312,7 +312,7 @@ def test_terrains():
     field_at = wp.transform((0.1, 0.0, 0.0), still)
     builder.add_shape_heightfield(heightfield=field, xform=field_at, label="hills")
     whole = builder.finalize(device="cpu")
-    same, bodies = SensorCapacitance(whole, ["*left", "*right"]), whole.state()
+    same, bodies = SensorCapacitance(whole, ["*left", "*right"], "patch"), whole.state()
 
     for places in (PLACES, PLACES[[1, 2, 0]]):
         truth = attached(model, places)
@@ -326,7 +326,7 @@ def test_terrains():
         for found in (sensors.read(state).delta, same.read(bodies).delta):
             off = np.abs(found - truth).max(axis=(2, 3))
             assert (off < 2e-3 * np.abs(truth).max(axis=(2, 3))).all()
-    assert len(sensors.terrains[0].known) == 3
+    assert len(sensors.terrains[0].known) == 4
 
 
 def example_of(heading):
