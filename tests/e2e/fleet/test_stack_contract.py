@@ -308,7 +308,8 @@ def test_terrains():
     for name, y in (("left", 0.03), ("right", -0.03)):
         world.add_site(robot, xform=wp.transform((0.0, y, 0.0), down), label=name)
     builder.replicate(world, WORLDS)
-    field = newton.Heightfield(hills(), 13, 17, 0.8, 0.6, min_z=0.0, max_z=0.2 * hills().max())
+    low, high = (0.2 * float(edge) for edge in (hills().min(), hills().max()))
+    field = newton.Heightfield(hills(), 13, 17, 0.8, 0.6, min_z=low, max_z=high)
     field_at = wp.transform((0.1, 0.0, 0.0), still)
     builder.add_shape_heightfield(heightfield=field, xform=field_at, label="hills")
     whole = builder.finalize(device="cpu")
