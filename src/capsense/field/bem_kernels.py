@@ -250,9 +250,7 @@ def _moments(panels: Panels, some: slice = slice(None)) -> Array:
     second = np.einsum("nq,nqa,nqb->nab", weights, off, off)
     turned = 3 * second - np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     a, b = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-    return np.ascontiguousarray(
-        np.vstack([centers.T, weights.sum(axis=1), turned[:, a, b].T])
-    )
+    return np.ascontiguousarray(np.vstack([centers.T, weights.sum(axis=1), turned[:, a, b].T]))
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

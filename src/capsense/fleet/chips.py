@@ -52,18 +52,18 @@ class ChipsOfSensors:
             own = None if seed is None else seed + number * SEED_STRIDE
             part.reset(rows, start=start, seed=own)
 
-    def clock(self, time: Any) -> Any:
+    def clock(self, time: Any, due: Any = None) -> Any:
         """As of :class:`ManyChips`."""
         for part in self._parts:
-            time = part.clock(time)
+            time = part.clock(time, due)
         return time
 
-    def sample(self, time: Any, matrix: Any, shields: Any) -> Held:
+    def sample(self, time: Any, matrix: Any, shields: Any, due: Any = None) -> Held:
         """As of the chips of either device."""
-        found = [
-            part.sample(time, *(None if x is None else x[:, k : k + 1] for x in (matrix, shields)))
-            for k, part in enumerate(self._parts)
-        ]
+        found = []
+        for k, part in enumerate(self._parts):
+            own = (None if x is None else x[:, k : k + 1] for x in (matrix, shields))
+            found.append(part.sample(time, *own, due))
         if self._registers is not None:
             return self._registers
         columns = zip(*(vars(held).values() for held in found), strict=True)

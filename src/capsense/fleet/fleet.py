@@ -24,6 +24,7 @@ from capsense.fleet.bodies import (
     BodyTable,
     checked_forces,
     checked_poses,
+    chosen_rows,
     host_array,
     on_device,
     require_no_gradient,
@@ -31,7 +32,7 @@ from capsense.fleet.bodies import (
 from capsense.fleet.check import FleetCheck, by_simulator, summary
 from capsense.fleet.chips import ChipsOfSensors
 from capsense.fleet.cpu import CpuCore
-from capsense.reading import FleetReading, Reading, StepStats
+from capsense.reading import FleetReading, FleetTouch, Reading, StepStats
 from capsense.readout import Readout
 from capsense.readout.checks import chosen
 from capsense.readout.config import make_readout
@@ -134,6 +135,7 @@ class Fleet:
         self.readouts: tuple[Readout, ...] = ()
         """The readout of which every sensor has a chip, or one for each sensor, if any."""
         self._chips: Any = None
+        self._last: FleetReading | None = None
         self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
         self._warp = None if device == "cpu" else self._on_warp(budget)
@@ -369,6 +371,7 @@ class Fleet:
         forces: ArrayLike | None = None,
         time: Any = None,
         jacobian: bool = False,
+        environments: Any = None,
     ) -> FleetReading:
         """Return the readings of all environments.
 
@@ -388,23 +391,42 @@ class Fleet:
                 its last step; a readout needs it. On Warp it may be an array on the device, of
                 shape (1,) or (e,) and single or double precision, which is not looked at.
             jacobian: Whether to work out ``reading.jacobian`` as well.
+            environments: Which environments are solved, numbers or a mask of shape (e,); all by
+                default. The reading holds for each of the others what it held last, and before its
+                first what an empty environment gives; their chips and clocks stand still. On Warp
+                it may be a mask on the device.
 
         Raises:
-            SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long;
-                there are forces and no cover, or a Jacobian is asked for with forces.
+            SceneError: There is no such environment; poses are of a wrong shape, not finite, or
+                their quaternions not 1 long; there are forces and no cover, or a Jacobian is asked
+                for with forces or of some environments.
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
         """
         if self._chips is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
         with self._one:
+            due = self._due(environments)
             if self._chips is not None:
-                time = self._chips.clock(time)
-            reading = self.solved(poses, sensors, forces=forces, jacobian=jacobian)
+                time = self._chips.clock(time, due)
+            reading = self.solved(
+                poses, sensors, forces=forces, jacobian=jacobian, environments=due
+            )
             if self._chips is None:
                 return reading
             matrix = reading.capacitance if self._warp is None else reading.delta
-            return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
+            held = self._chips.sample(time, matrix, reading.shield_coupling, due)
+            return replace(reading, held=held)
+
+    def _due(self, environments: Any) -> Any:
+        """Which environments are solved: a mask, None for all; one on the device as it is."""
+        if environments is None:
+            return None
+        if on_device(environments):
+            if self._warp is not None:
+                return self._warp.mask(environments)
+            environments = host_array(environments)
+        return np.isin(np.arange(self.count), chosen_rows(environments, self.count))
 
     def _forces(self, forces: ArrayLike | None, jacobian: bool) -> Any:
         """Forces on the bodies [N], shape (e, b); those on a device of Warp are not looked at.
@@ -435,9 +457,13 @@ class Fleet:
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *,
-        forces: ArrayLike | None = None, jacobian: bool = False,
+        forces: ArrayLike | None = None, jacobian: bool = False, environments: Any = None,
     ) -> FleetReading:  # fmt: skip
         """As :meth:`step`, without chips and their time."""
+        if jacobian and environments is not None:
+            raise SceneError(
+                "a Jacobian is asked for of some environments; leave environments out, or jacobian"
+            )
         if jacobian and self.table.lossy:
             raise SceneError(
                 "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
@@ -448,12 +474,17 @@ class Fleet:
         if self._warp is None:
             if sensors is None:
                 sensors = np.broadcast_to(WORLD, shapes[1])
-            return self._cpu.step(
-                checked_poses("poses", poses, shapes[0]),
-                checked_poses("sensors", sensors, shapes[1]),
-                held,
+            rows = None if environments is None else np.flatnonzero(environments)
+            pick = slice(None) if rows is None else rows
+            found = self._cpu.step(
+                checked_poses("poses", poses, shapes[0])[pick],
+                checked_poses("sensors", sensors, shapes[1])[pick],
+                held[pick],
                 jacobian,
+                rows,
             )
+            self._last = found if rows is None else _with_rows(self._last_or_empty(), rows, found)
+            return self._last
         for name, each in (("poses", poses), ("sensors", sensors)):
             require_no_gradient(name, each)
         where, at = (
@@ -463,12 +494,28 @@ class Fleet:
             )
         )
         core = self._warp
-        core.solve(where, at, None if forces is None else held)
+        core.solve(where, at, None if forces is None else held, environments)
         return FleetReading(
             core.capacitance, core.delta, self.electrode_names, core.error,
             shield_coupling=core.shields,
             conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
             touch=core.touch,
+        )  # fmt: skip
+
+    def _last_or_empty(self) -> FleetReading:
+        """The last reading on the CPU; before the first, that of empty environments."""
+        if self._last is not None:
+            return self._last
+        empty, shape = self.empty, (self.count, self.sensors)
+
+        def everywhere(values: Array) -> Array:
+            return np.broadcast_to(values, (*shape, *values.shape)).copy()
+
+        each = np.zeros((*shape, len(self.baseline)))
+        touch = None if self.design.cover is None else FleetTouch(each, each, np.zeros(shape))
+        return FleetReading(
+            everywhere(empty.capacitance), everywhere(empty.delta), self.electrode_names,
+            np.zeros(shape), everywhere(empty.shield_coupling), touch=touch,
         )  # fmt: skip
 
     def check(
@@ -557,3 +604,27 @@ class Fleet:
         """
         nodes = None if self._warp is None else self._warp.gap.slots
         return self._cpu.lifted(poses, sensors, rows, nodes)
+
+
+def _with_rows(reading: FleetReading, rows: NDArray[np.int64], found: FleetReading) -> FleetReading:
+    """A reading whose rows are those of another of so many environments, but for its Jacobian."""
+
+    def merged(old: Any, new: Any) -> Any:
+        if old is None and new is None:
+            return None
+        if old is None:
+            old = np.zeros((len(reading.delta), *new.shape[1:]))
+        out = np.array(old)
+        out[rows] = 0.0 if new is None else new
+        return out
+
+    names = ("capacitance", "delta", "error", "shield_coupling", "conductance")
+    values = {name: merged(getattr(reading, name), getattr(found, name)) for name in names}
+    if reading.touch is not None and found.touch is not None:
+        parts = (merged(*both) for both in zip(_of(reading.touch), _of(found.touch), strict=True))
+        values["touch"] = FleetTouch(*parts)
+    return replace(reading, jacobian=None, held=None, **values)
+
+
+def _of(touch: FleetTouch) -> tuple[Any, Any, Any]:
+    return touch.force, touch.compression, touch.total

@@ -204,9 +204,12 @@ def _normal(key: wp.uint64, sample: int, stages: int, stage: int, column: int):
 
 
 @wp.kernel
-def tell(time: wp.array(dtype=Any), state: State):
-    """Tell each environment its time [s]; one for all, or one for each."""
+def tell(time: wp.array(dtype=Any), due: wp.array(dtype=wp.int32), state: State):
+    """Tell each environment that is due its time [s]; one for all, or one for each."""
     e = wp.tid()
+    if due[e] == 0:
+        state.now[e] = state.before[e]
+        return
     state.now[e] = wp.float64(time[e % time.shape[0]]) - state.start[e]
 
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from capsense.errors import ReadoutError
 from capsense.fleet import warp_chip_kernels as kernels
 from capsense.fleet.bodies import on_device
+from capsense.fleet.warp_cut import mark
 from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor, ResponseCurve
 from capsense.readout.checks import Array, Ints
@@ -76,7 +77,7 @@ class WarpChips(ManyChips):
         state.waiting = self._room(self._depth, k, chips, dtype=wp.vec2d)
         state.poles = self._room(len(self._chip.keep), k, chips)
         self._state, self._time = state, self._room(e)
-        self._which = self._room(e, dtype=wp.int32)
+        self._which, self._due = (self._room(e, dtype=wp.int32) for _ in range(2))
         self._held = held or registers(device, e, s, k)
         for name, values in self._lanes().items():
             setattr(state, name, self._array(values, _WORDS.get(name, wp.float64)))
@@ -205,10 +206,16 @@ class WarpChips(ManyChips):
         table = np.concatenate(tables) if tables else np.zeros((0, e * s * k))
         chip.table = array(table.reshape(len(table), e * s, k).transpose(0, 2, 1))
 
-    def clock(self, time: Any) -> Any:
-        """As of :class:`ManyChips`; an array on the device is not looked at."""
+    def clock(self, time: Any, due: Any = None) -> Any:
+        """As of :class:`ManyChips`; an array on the device is not looked at.
+
+        Nor does a mask on the device tell which of the host's times are looked at.
+        """
+        if not on_device(time) and on_device(due):
+            times = np.broadcast_to(np.asarray(time, float), self.shape[:1])
+            return self._array(times)
         if not on_device(time):
-            return super().clock(time)
+            return super().clock(time, due)
         time = time if isinstance(time, wp.array) else wp.from_dlpack(time)
         fits = time.dtype in (wp.float32, wp.float64) and time.shape in ((1,), (self.shape[0],))
         if not fits:
@@ -218,7 +225,7 @@ class WarpChips(ManyChips):
             )
         return time
 
-    def sample(self, time: Any, delta: Any, shields: Any) -> Held:
+    def sample(self, time: Any, delta: Any, shields: Any, due: Any = None) -> Held:
         """Tell what the sensors see at a time; get what the chips' registers hold.
 
         Args:
@@ -226,6 +233,7 @@ class WarpChips(ManyChips):
                 array on the device that holds it, of shape (1,) or (e,), which is not looked at.
             delta: Change of the Maxwell matrices [F], shape (e, s, n, n).
             shields: Charge on each electrode per volt on all shields together [F], (e, s, n).
+            due: Mask of the environments whose clocks go on, of NumPy or of Warp; None for all.
 
         Returns:
             Arrays of shape (e, s, K), written anew by the next call.
@@ -233,7 +241,7 @@ class WarpChips(ManyChips):
         Raises:
             ReadoutError: Time is not finite or goes back, or an array is another one.
         """
-        time = self.clock(time)
+        time = self.clock(time, due)
         if isinstance(time, np.ndarray):
             self._last[:] = time
             if (time == time[0]).all():
@@ -241,9 +249,15 @@ class WarpChips(ManyChips):
             else:
                 self._time.assign(time)
             time = self._time
+        if due is None:
+            self._due.fill_(1)
+        elif isinstance(due, np.ndarray):
+            self._due.assign(due.astype(np.int32))
+        else:
+            self._launch(mark, self.shape[0], [due, self._due])
         held, dim, state = self._held, self._state.raw.shape, self._state
         registers = [held.code, held.capacitance, held.age]
-        self._launch(kernels.tell, self.shape[0], [time, state])
+        self._launch(kernels.tell, self.shape[0], [time, self._due, state])
         self._launch(kernels.channels, dim, [self._chip, delta, shields, state])
         self._launch(kernels.convert, dim, [self._chip, state, *registers])
         self._launch(kernels.pass_on, self.shape[0], [state])

@@ -137,8 +137,11 @@ class ManyChips:
         for name, found in self.randomisation.draw(chips, rows, size).items():
             self._figures[name][rows] = found
 
-    def clock(self, time: Any) -> Array:
+    def clock(self, time: Any, due: NDArray[np.bool_] | None = None) -> Array:
         """Times of all environments [s], shape (e,), of a number or one for each.
+
+        Clocks of environments that are not due stand still: their times are those of their last
+        samples, -inf before the first.
 
         Raises:
             ReadoutError: One is not finite, or before that of the last sample.
@@ -150,7 +153,10 @@ class ManyChips:
             raise ReadoutError(
                 f"time is {time!r}; give a number of seconds, or one for each of {e} environments"
             ) from None
-        for number in np.flatnonzero(~(np.isfinite(times) & (times >= self._last))):
+        wrong = ~(np.isfinite(times) & (times >= self._last))
+        if due is not None:
+            times, wrong = np.where(due, times, self._last), wrong & due
+        for number in np.flatnonzero(wrong):
             try:
                 Readout.require_forward(float(times[number]), float(self._last[number]))
             except ReadoutError as error:
@@ -204,9 +210,9 @@ class SideBySide(ManyChips):
             if hasattr(process, "restart"):
                 process.restart(lanes)
 
-    def clock(self, time: Any) -> Array:
+    def clock(self, time: Any, due: NDArray[np.bool_] | None = None) -> Array:
         """As of :class:`ManyChips`; leaps over more conversions than anybody wants are refused."""
-        times = super().clock(time)
+        times = super().clock(time, due)
         wanted = (times - self._start) / self._one.schedule.period * np.prod(self.shape[1:])
         seen = self._taken.reshape(len(times), -1).sum(axis=1)
         if np.maximum(wanted - seen, 0.0).sum() > AT_ONCE:
@@ -218,8 +224,9 @@ class SideBySide(ManyChips):
         return times
 
     def sample(
-        self, time: Any, capacitance: NDArray[np.floating], shield_coupling: Array | None = None
-    ) -> Held:
+        self, time: Any, capacitance: NDArray[np.floating], shield_coupling: Array | None = None,
+        due: NDArray[np.bool_] | None = None,
+    ) -> Held:  # fmt: skip
         """Tell the capacitances of an instant; get what the chips' registers hold.
 
         Args:
@@ -228,6 +235,7 @@ class SideBySide(ManyChips):
                 e · s in all.
             shield_coupling: Charge on each electrode per volt on all shields together [F], shape
                 (..., M); None where there are no shields.
+            due: Mask of the environments whose clocks go on, shape (e,); all by default.
 
         Returns:
             The last conversion of every channel, each of shape (..., K), and its age.
@@ -236,10 +244,12 @@ class SideBySide(ManyChips):
             ReadoutError: Time goes back or is not finite, or the capacitances do not fit.
         """
         values = self._seen(np.asarray(capacitance), shield_coupling)
-        times, lanes_each = self.clock(time), math.prod(self.shape[1:])
+        times, lanes_each = self.clock(time, due), math.prod(self.shape[1:])
         now = np.repeat(times - self._start, lanes_each)
         before = np.repeat(self._last - self._start, lanes_each)
         value = values.ravel()
+        if due is not None:
+            value = np.where(np.repeat(due, lanes_each), value, self._values)
         old = np.where(before == -math.inf, value, self._values)
         start, plan = np.repeat(self._start, lanes_each), self._one.schedule
         while True:
