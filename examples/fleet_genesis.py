@@ -41,7 +41,7 @@ def main(environments: int = 16) -> np.ndarray:
     for k in range(STEPS):
         scene.step()
         if k % EVERY == 0:
-            found.append(pad.read().numpy(force=True))
+            found.append(pad.read().delta[:, 0].numpy(force=True))
             near, far = (1e15 * found[-1][e, 0, 0] for e in (0, -1))
             print(f"{1e3 * (k + 1) * STEP:5.0f} ms: {near:7.1f} fF at 7 cm, {far:6.1f} at 15 cm")
     return np.array(found)

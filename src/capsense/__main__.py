@@ -23,6 +23,7 @@ from capsense.cli import (
     design,
     layout,
     recordings,
+    ros,
     run,
     say,
     serve,
@@ -33,7 +34,7 @@ from capsense.errors import CapSenseError, FieldError, SolveError
 
 COMMANDS = (
     run.run, run.record, recordings.replay, recordings.export, design.design, layout.layout,
-    recordings.readout,
+    recordings.readout, ros.ros,
     studies.dataset, studies.sweep, studies.tolerance, studies.optimise, studies.bench,
     studies.reproduce, serve.serve, serve.view, warmup.warmup,
 )  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,8 +13,6 @@ from approximate import approx
 
 import capsense as cs
 from capsense.__main__ import build_parser
-from capsense.design import parse_design
-from capsense.scenario import parse_scenario
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -48,13 +45,11 @@ def test_readme_commands() -> None:
 
 
 def test_readme_snippets() -> None:
-    """Python compiles and uses public names; TOML is a scenario and a design."""
+    """Python compiles and uses public names; the page is short."""
     for code in blocks(README, "python"):
         compile(code, "README.md", "exec")
         assert set(re.findall(r"\bcs\.(\w+)", code)) <= {*cs.__all__, "mujoco", "pybullet"}
-    scenario, design = (tomllib.loads(text) for text in blocks(README, "toml"))
-    assert parse_scenario(scenario).count == 151
-    assert parse_design(design).electrode_names == ("left", "right")
+    assert len(README.splitlines()) <= 120
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

@@ -33,8 +33,12 @@ def parameters(function: Callable[..., Any]) -> list[tuple[str, Any, Any, Any]]:
 
 @pytest.mark.parametrize("name", ["use_readout", "reset"])
 def test_readouts_are_set_and_reset_alike(name: str) -> None:
-    """One signature, wherever sensors have chips."""
-    found = [getattr(kind, name) for kind in WITH_CHIPS]
+    """One signature, wherever sensors have chips; fleets have environments besides."""
+    found = [getattr(kind, name) for kind in WITH_CHIPS if kind is not cs.Fleet]
+    many = {p[0]: p[2] for p in parameters(getattr(cs.Fleet, name))}
+    further = {"use_readout": "randomisation", "reset": "environments"}[name]
+    assert many.pop(further) is None
+    assert many == {p[0]: p[2] for p in parameters(found[0])}
     for function in found:
         assert parameters(function) == parameters(found[0]), function
         assert inspect.signature(function).return_annotation == "None"

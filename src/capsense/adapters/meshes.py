@@ -8,6 +8,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +22,8 @@ Array = NDArray[np.float64]
 _TILE = 0.3
 """Tiles of a terrain, from one to the next of which another part of it is seen, are about so wide
 [m], or a cell if that is wider."""
+_WIDE = 0.4
+"""Of terrains of larger half extents [m], the part around the sensor is given out."""
 _KEPT = 8
 """So many parts of a terrain are kept, with all that was worked out for them."""
 
@@ -160,6 +163,13 @@ class Terrain:
         low, high = float(self.heights.min()), float(self.heights.max())
         return np.array([[-x, -y, min(low, -self.base)], [x, y, high]])
 
+    def tiles(self, centres: Array) -> NDArray[np.int64]:
+        """Numbers of the tiles along x and y that points, shape (..., 3), are over."""
+        out = np.empty((*centres.shape[:-1], 2), np.int64)
+        for axis in (0, 1):
+            out[..., axis] = self._first(axis, centres[..., axis]) // self._cells(axis)
+        return out
+
     def near(self, centre: Array, reach: float) -> TriMesh:
         """The part within a distance [m] along x and y of the tile that a point (3,) is over.
 
@@ -188,11 +198,28 @@ class Terrain:
 
     def _nodes(self, axis: int, at: float, reach: float) -> slice:
         """Rows or columns of the part that is seen from a place [m] along an axis."""
-        width, cells = self._cell(axis), self.heights.shape[1 - axis] - 1
-        many, more = max(1, round(_TILE / width)), math.ceil(reach / width)
-        place = min(max(at + self.half[axis], 0.0), (cells - 0.5) * width)
-        first = int(place / (many * width)) * many
+        width, cells, many = self._cell(axis), self.heights.shape[1 - axis] - 1, self._cells(axis)
+        more, first = math.ceil(reach / width), int(self._first(axis, np.asarray(at)))
         return slice(max(0, first - more), min(cells, first + many + more) + 1)
+
+    def _cells(self, axis: int) -> int:
+        """How many cells a tile has along x (0) or y (1)."""
+        return max(1, round(_TILE / self._cell(axis)))
+
+    def _first(self, axis: int, at: Array) -> Any:
+        """First cells of the tiles that places [m] along an axis are over."""
+        width, cells, many = self._cell(axis), self.heights.shape[1 - axis] - 1, self._cells(axis)
+        place = np.minimum(np.maximum(at + self.half[axis], 0.0), (cells - 0.5) * width)
+        return (place / (many * width)).astype(np.int64) * many
+
+
+def terrain_shape(
+    heights: Array, half: tuple[float, float], base: float, label: str, *, solid: bool
+) -> TriMesh | Terrain:
+    """A terrain, or the whole of it as a mesh where it is small; arguments as of its fields."""
+    if max(half) > _WIDE:
+        return Terrain(heights, half, base, solid, label)
+    return solid_mesh(*height_field(heights, half, base), label)
 
 
 def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Array, Array]:

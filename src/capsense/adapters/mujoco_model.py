@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from capsense.adapters import WorldSource
 from capsense.adapters.contacts import Contact
-from capsense.adapters.meshes import Terrain, height_field, primitive, solid_mesh
+from capsense.adapters.meshes import Terrain, primitive, solid_mesh, terrain_shape
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
@@ -27,8 +27,6 @@ _SCALAR_LAST = [1, 2, 3, 0]
 MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
-_WIDE = 0.4
-"""Of terrains of larger half extents [m], the part around the sensor is given out."""
 _HEIGHT_FIELD = 1
 """Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
@@ -209,10 +207,7 @@ class ModelReader:
         start = int(m.hfield_adr[field])
         half_x, half_y, top, base = m.hfield_size[field].tolist()
         heights = top * m.hfield_data[start : start + rows * columns].reshape(rows, columns)
-        if max(half_x, half_y) > _WIDE:
-            return Terrain(heights, (half_x, half_y), base, solid, names[-1])
-        vertices, faces = height_field(heights, (half_x, half_y), base)
-        return solid_mesh(vertices, faces, names[-1])
+        return terrain_shape(heights, (half_x, half_y), base, names[-1], solid=solid)
 
 
 def _check_groups(groups: Any) -> None:

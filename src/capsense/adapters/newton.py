@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from capsense.adapters.meshes import primitive, solid_mesh
+from capsense.adapters.grounds import Ground
+from capsense.adapters.meshes import primitive, solid_mesh, terrain_shape
 from capsense.adapters.parallel import (
     FleetOptions,
     ParallelSensors,
@@ -21,32 +22,39 @@ from capsense.adapters.parallel import (
     warn_left_out,
 )
 from capsense.adapters.rules import Rules, split_rules
+from capsense.adapters.world import HalfSpace
 from capsense.design.model import Design
 from capsense.errors import SceneError
+from capsense.reading import FleetReading
 from capsense.scene import Body, Shape
 from capsense.simulator import DEFAULT_DESIGN
+
+_BASE = 0.1
+"""Depth of the floor of a height field below its lowest point, over its half width."""
 
 
 class SensorCapacitance(ParallelSensors):
     """Capacitive proximity sensors on sites of a Newton model, in all of its worlds.
 
     Worlds must hold the same shapes in the same order, as ``ModelBuilder.replicate`` makes them;
-    sizes may differ. Shapes outside of all worlds are seen by all. Planes, height fields, cones and
-    Gaussians are not seen. Sizes and materials are those of the model when the sensor is made;
-    change :attr:`fleet` for others.
+    sizes may differ. Shapes outside of all worlds are seen by all. Cones and Gaussians are not
+    seen. The sizes in ``model.shape_scale`` are followed, but for planes and height fields; change
+    :attr:`fleet` for other materials.
 
     Args:
         model: The model, after ``ModelBuilder.finalize``.
         sites: Label patterns of the sites; those of the first world decide.
-        design: A design, its name, or the path of its file, for all sites.
+        design: A design, its name, or the path of its file, for all sites. For sites of several
+            designs see :meth:`by_design`.
         options: What is seen and what it is made of, by the labels of shapes; and ``device``,
-            ``preset``, ``budget``. All are those of
-            :class:`~capsense.adapters.parallel.FleetOptions`.
+            ``preset``, ``budget``, ``readout``, ``randomisation``, ``seed``, ``history_length``.
+            All are those of :class:`~capsense.adapters.parallel.FleetOptions`.
 
     Raises:
         SceneError: There is no such site, a pattern fits nothing, nothing can be seen, or worlds
             differ in their shapes.
         DesignError: The design is wrong.
+        ReadoutError: As by :meth:`Fleet.use_readout`.
     """
 
     def __init__(
@@ -71,13 +79,15 @@ class SensorCapacitance(ParallelSensors):
             if not reader.known(table[0, column]):
                 left.append(labels[column])
                 continue
-            bodies = [reader.body(k, labels[column]) for k in table[:, column].tolist()]
+            bodies: Any = reader.ground(table[0, column], labels[column])
+            if bodies is None:
+                bodies = [reader.body(k, labels[column]) for k in table[:, column].tolist()]
             link, label = int(carrier[table[0, column]]), labels[column]
             tree = int(trees[link]) if link >= 0 else -1
             owner = rules.tie_of((label,)).owner
             parts.append(WorldShape((label,), link, tree, owner, bodies))
             columns.append(column)
-        warn_left_out(left, "a fleet sees no planes, height fields, cones and Gaussians")
+        warn_left_out(left, "a fleet sees no cones and Gaussians")
         known = np.flatnonzero(site)
         names = [labels[k] for k in known]
         chosen = known[matching(names, sites, "site")]
@@ -87,22 +97,30 @@ class SensorCapacitance(ParallelSensors):
         local = model.shape_transform.numpy()
         seen = np.array([columns[k] for k in self.chosen])
         self._fix(*((carrier[table[:, k]], local[table[:, k]]) for k in (seen, chosen)))
+        self._reader, self._model, self._shapes = reader, model, table[:, seen]
+        self._labels = [labels[k] for k in seen.tolist()]
+        self._sizes = model.shape_scale.numpy()[self._shapes]
         self.capacitance: Any = None
         self.delta: Any = None
         """Maxwell matrices of the last update and their change by the bodies [F], shape (worlds,
         sites, n, n)."""
 
-    def update(self, state: Any, *, time: float | None = None) -> None:
-        """Read all worlds.
+    def update(self, state: Any, *, time: Any = None, environments: Any = None) -> None:
+        """Read all worlds, or some.
 
         Args:
             state: The state, whose ``body_q`` is up to date.
             time: As of :meth:`Fleet.step`, where a readout is used.
+            environments: Which worlds are solved, as of :meth:`Fleet.step`; all by default.
 
         Raises:
             ReadoutError: As by :meth:`Fleet.step`.
             SolveError: As by :meth:`Fleet.step`.
         """
+        self.read(state, time=time, environments=environments)
+
+    def read(self, state: Any, *, time: Any = None, environments: Any = None) -> FleetReading:
+        """As :meth:`update`; returns the reading."""
         bodies = state.body_q
         # bodies of all worlds stand in one row, which every world is shown
         self._follow(
@@ -111,8 +129,44 @@ class SensorCapacitance(ParallelSensors):
                 strides=(0, bodies.strides[0]), device=bodies.device,
             )
         )  # fmt: skip
-        self.reading = self._read(time)
+        self.reading = self._read(time, environments)
         self.capacitance, self.delta = self.reading.capacitance, self.reading.delta
+        return self.reading
+
+    def _resized(self) -> Iterator[tuple[int, NDArray[np.integer], list[Body]]]:
+        now = self._model.shape_scale.numpy()[self._shapes]
+        changed = (now != self._sizes).any(axis=2)
+        self._sizes = now
+        if changed.any():
+            self._reader.look()
+        for place in np.flatnonzero(changed.any(axis=0)).tolist():
+            shapes, label = self._shapes[:, place], self._labels[place]
+            if self._reader.ground(shapes[0], label) is None:
+                rows = np.flatnonzero(changed[:, place])
+                bodies = {k: self._reader.body(k, label) for k in set(shapes[rows].tolist())}
+                alike = {id(body): self._like(place, body.shape) for body in bodies.values()}
+                yield place, rows, [alike[id(bodies[k])] for k in shapes[rows].tolist()]
+
+    def draw(
+        self, viewer: Any, name: str = "/capsense/electrodes", environments: Any = None
+    ) -> None:
+        """Draw the electrodes in a viewer of Newton, coloured by their signals.
+
+        They are drawn where the sensors were at the last reading.
+
+        Args:
+            viewer: Any of ``newton.viewer``.
+            name: What the lines are called there.
+            environments: Of which worlds; all by default.
+
+        Raises:
+            SceneError: There is no such world.
+        """
+        starts, ends, colours = (
+            wp.array(values.astype(np.float32), dtype=wp.vec3, device=viewer.device)
+            for values in self.electrode_lines(environments)
+        )
+        viewer.log_lines(name, starts, ends, colours)
 
 
 def _by_world(model: Any) -> NDArray[np.int64]:
@@ -149,19 +203,48 @@ class _Reader:
         from newton import GeoType
 
         self._kinds = GeoType
-        self._type, self._scale = model.shape_type.numpy(), model.shape_scale.numpy()
+        self._model, self._type = model, model.shape_type.numpy()
+        self.look()
         self._source = model.shape_source
         self._rules = rules
         self._made: dict[Any, Body] = {}
+        self._fields: dict[Any, Any] = {}
 
     def known(self, shape: int) -> bool:
         kinds = self._kinds
         return int(self._type[shape]) in {
             int(k) for k in (
                 kinds.SPHERE, kinds.CAPSULE, kinds.ELLIPSOID, kinds.CYLINDER, kinds.BOX,
-                kinds.MESH, kinds.CONVEX_MESH,
+                kinds.MESH, kinds.CONVEX_MESH, kinds.PLANE, kinds.HFIELD,
             )
         }  # fmt: skip
+
+    def look(self) -> None:
+        """Take over the sizes of the model."""
+        self._scale = self._model.shape_scale.numpy()
+
+    def ground(self, shape: int, label: str) -> Ground | None:
+        """A plane or a wide height field, None for all others."""
+        kind, rules = int(self._type[shape]), self._rules
+        if kind not in (int(self._kinds.PLANE), int(self._kinds.HFIELD)):
+            return None
+        material, grounding = rules.material_of((label,)), rules.tie_of((label,)).grounding
+        made = HalfSpace() if kind == int(self._kinds.PLANE) else self._terrain(shape, label)
+        return None if isinstance(made, Shape) else Ground(made, material, grounding)
+
+    def _terrain(self, shape: int, label: str) -> Any:
+        """A height field; those of all worlds share their mesh or terrain."""
+        field, size = self._source[shape], tuple(self._scale[shape].tolist())
+        key = id(field), size, label
+        if key not in self._fields:
+            low, high = float(field.min_z), float(field.max_z)
+            rows = np.asarray(field.data, float).reshape(field.nrow, field.ncol)
+            heights = size[2] * (low + (high - low) * rows)
+            half = size[0] * float(field.hx), size[1] * float(field.hy)
+            base = max(0.0, -float(heights.min())) + _BASE * max(half)
+            solid = not self._rules.material_of((label,)).is_conductor()
+            self._fields[key] = terrain_shape(heights, half, base, label, solid=solid)
+        return self._fields[key]
 
     def body(self, shape: int, label: str) -> Body:
         kind, size = int(self._type[shape]), tuple(self._scale[shape].tolist())
@@ -175,6 +258,8 @@ class _Reader:
         made = primitive(self._kinds(kind).name, size)
         if made is not None:
             return made
+        if kind == int(self._kinds.HFIELD):
+            return self._terrain(shape, label)
         mesh = self._source[shape]
         vertices = np.asarray(mesh.vertices, float) * np.array(size)
         faces = np.asarray(mesh.indices).reshape(-1, 3)

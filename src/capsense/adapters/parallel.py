@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import Any, Self, TypeVar, no_type_check
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from capsense.adapters.rules import AttachOptions, Names, Rules
+from capsense._style import signal_colours, strength
+from capsense.adapters.grounds import Ground, TerrainParts
+from capsense.adapters.meshes import Terrain
+from capsense.adapters.record import ParallelData, Record
+from capsense.adapters.rules import AttachOptions, Names, Rules, matches
+from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
 from capsense.fleet import Fleet
+from capsense.fleet.bodies import chosen_rows, on_device
 from capsense.reading import FleetReading
-from capsense.scene import Body
+from capsense.readout import Readout
+from capsense.readout.randomisation import ReadoutRandomisation
+from capsense.scene import Body, Shape
 from capsense.simulator import PresetName
 from capsense.solver.tree.matter import matter_of
 
@@ -37,6 +45,14 @@ class FleetOptions(AttachOptions, total=False):
     preset: PresetName
     budget: int
     """Accuracy on the CPU and on Warp, as of a fleet."""
+    readout: Readout | str | Path | None
+    """A readout, a chip's name or a file, of which every sensor has a chip; none by default."""
+    randomisation: ReadoutRandomisation | None
+    """In what chips differ, drawn anew at a reset; see :meth:`Fleet.use_readout`."""
+    seed: int | None
+    """Of all random numbers of the chips; by default the readout's own."""
+    history_length: int
+    """How many readings of each world are kept in ``data.history``; none by default."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +67,24 @@ class WorldShape:
     """What hangs together by joints has the same number; -1 for what is fixed to the world."""
     owner: str
     """The rule that says what ties it to ground, see :class:`~capsense.adapters.rules.Tie`."""
-    bodies: Body | Sequence[Body | None]
+    bodies: Body | Sequence[Body | None] | Ground
     """What it is: one for all worlds, or one for each, None where there is none."""
+
+    @property
+    def ground(self) -> Ground | None:
+        """The matter that goes on below a face, if it is that."""
+        return self.bodies if isinstance(self.bodies, Ground) else None
 
 
 class ParallelSensors:
-    """Sensors on several sites of a robot, in all worlds of a simulator.
+    """Sensors of one design on several sites of a robot, in all worlds of a simulator.
 
     Conductors that hang together by joints and float, or have a capacitance to ground, by one rule
     are one conductor, whether they touch or not. A capacitance is shared out among all of its rule.
+
+    A plane is a half space: the part near each sensor is seen, as a plate. Of a terrain that is
+    wider than 0.8 m each sensor has a part of its own, which is looked up at every reading from
+    where the sensors are; on a GPU this waits for the device.
 
     Args:
         parts: Shapes of a world.
@@ -72,6 +97,7 @@ class ParallelSensors:
 
     Raises:
         SceneError: Nothing can be seen, or the rules leave everything out.
+        ReadoutError: As by :meth:`Fleet.use_readout`.
     """
 
     def __init__(
@@ -85,32 +111,169 @@ class ParallelSensors:
         options: Mapping[str, Any],
     ) -> None:
         rules.check([part.names for part in parts])
-        self.chosen = [k for k, part in enumerate(parts) if not rules.excludes(part.names)]
-        """Which of the parts are seen."""
-        if not self.chosen:
+        self.design = design if isinstance(design, Design) else load_design(design)
+        kept = [k for k, part in enumerate(parts) if not rules.excludes(part.names)]
+        if not kept:
             raise SceneError("there is nothing to see: all shapes are left out")
-        seen = [parts[k] for k in self.chosen]
+        length = _whole("history_length", options.get("history_length", 0))
+        grounds = [parts[k].ground for k in kept]
+        domain = self.design.domain
+        seen = [
+            parts[k] if ground is None else replace(parts[k], bodies=ground.body(domain))
+            for k, ground in zip(kept, grounds, strict=True)
+        ]
         first = [_some_body(part) for part in seen]
-        where = options.get("device") or ("cpu" if device.is_cpu else str(device))
+        count = len(sites)
+        places = self._places = _numbered(grounds, count)
+        """Numbers of the places of each part that is seen; of a terrain one for each sensor."""
+        self.chosen = [k for k, mine in zip(kept, places, strict=True) for _ in mine]
+        """Which of the parts stands in each place."""
+        own_device = "cpu" if device.is_cpu else str(device)
+        fleet_options = {k: options[k] for k in ("preset", "budget") if k in options}
         self.fleet = Fleet(
-            design, first, worlds, sensors=len(sites), **{**options, "device": where}
-        )
+            self.design,
+            [body for body, mine in zip(first, places, strict=True) for _ in mine],
+            worlds, sensors=count, device=options.get("device") or own_device, **fleet_options,
+        )  # fmt: skip
         """The fleet: its places are the shapes, its sensors the sites."""
-        self.names = tuple(part.names[-1] for part in seen)
+        self.names = tuple(parts[k].names[-1] for k in self.chosen)
         self.sites = tuple(name for name, _ in sites)
         """Names of the shapes that are seen, and of the sites, in order."""
+        self.carriers = self.sites
+        """What carries each sensor, by name."""
         shared, groups = _connected(seen, self.fleet.excitation_frequency)
-        for place, bodies in enumerate(shared):
-            if bodies is not first[place]:
-                self.fleet.change(place, bodies)
+        for part, bodies in enumerate(shared):
+            for place in places[part]:
+                if _is_terrain(grounds[part]):
+                    self.fleet.change(place, None)
+                elif bodies is not first[part]:
+                    self.fleet.change(place, bodies)
         for group in groups:
-            self.fleet.join(group)
-        if rules.exclude_own:
-            for sensor, (_, own) in enumerate(sites):
-                mine = [k for k, part in enumerate(seen) if part.body == own >= 0]
-                self.fleet.hide(sensor, mine)
-        self._poses = wp.zeros((worlds, len(seen)), dtype=wp.transform, device=device)
-        self._frames = wp.zeros((worlds, len(sites)), dtype=wp.transform, device=device)
+            self.fleet.join([place for part in group for place in places[part]])
+        for sensor, (_, own) in enumerate(sites):
+            hidden = [
+                place
+                for part, mine in enumerate(places)
+                for k, place in enumerate(mine)
+                if (rules.exclude_own and seen[part].body == own >= 0)
+                or (_is_terrain(grounds[part]) and k != sensor)
+            ]
+            self.fleet.hide(sensor, hidden)
+        self._matter = [_some_body(replace(seen[k], bodies=shared[k])) for k in range(len(seen))]
+        self.terrains = [
+            TerrainParts(ground.shape, self._matter[part], places[part], worlds, domain)
+            for part, ground in enumerate(grounds)
+            if ground is not None and isinstance(ground.shape, Terrain)
+        ]
+        """The parts of terrains that sensors are over."""
+        self._poses = wp.zeros((worlds, len(self.chosen)), dtype=wp.transform, device=device)
+        self._frames = wp.zeros((worlds, count), dtype=wp.transform, device=device)
+        drops = [
+            0.0 if ground is None else ground.drop(domain)
+            for ground, mine in zip(grounds, places, strict=True) for _ in mine
+        ]  # fmt: skip
+        self._drops = wp.array(drops, dtype=wp.float32, device=device) if any(drops) else None
+        self._looked = False
+        if options.get("readout") is not None:
+            given = {k: options[k] for k in ("seed", "randomisation") if k in options}
+            self.fleet.use_readout(options["readout"], **given)
+        chip = self.fleet.readout
+        self._record = Record(
+            self.fleet.empty, (worlds, count), 0 if chip is None else len(chip.bank),
+            self.design.cover is not None, length, device,
+        )  # fmt: skip
+        self._segments: tuple[NDArray[Any], NDArray[Any]] | None = None
+
+    @classmethod
+    def by_design(
+        cls, *source: Any, designs: Mapping[str, Design | str | Path], **options: Any
+    ) -> SensorsByDesign[Self]:
+        """Sensors of several designs.
+
+        Args:
+            source: What the class takes before the sites: the model, and what goes with it.
+            designs: Name pattern of sites → their design.
+            options: As of the class.
+
+        Raises:
+            SceneError: Two designs have one name; or as by the class.
+        """
+        make: Any = cls
+        return SensorsByDesign({
+            name: make(*source, sites, design, **options)
+            for name, (design, sites) in patterns_by_design(designs).items()
+        })  # fmt: skip
+
+    @property
+    def data(self) -> ParallelData:
+        """What the sensors read last, as arrays of Warp."""
+        return self._record.data
+
+    def reset(self, environments: Any = None, *, seed: int | None = None) -> None:
+        """Restart the chips, clear the record, and look for shapes of other sizes.
+
+        Call it when the simulator has set worlds back. The clocks of their chips begin at 0 s.
+
+        Args:
+            environments: Numbers of the worlds, or a mask; all by default.
+            seed: As of :meth:`Fleet.reset`.
+
+        Raises:
+            SceneError: There is no such world.
+            ReadoutError: As by :meth:`Fleet.reset`.
+        """
+        mask = self._mask(environments)
+        self._record.clear(mask)
+        self._looked = False
+        if self.fleet.readout is not None:
+            self.fleet.reset(None if mask is None else mask.numpy(), seed=seed)
+
+    def follow_sizes(self) -> None:
+        """Look at the next reading whether the simulator has changed the sizes of shapes.
+
+        A reset does so too, and arrays on the CPU are looked at in any case.
+        """
+        self._looked = False
+
+    def frames(self) -> NDArray[np.float64]:
+        """Where the sensors were at the last reading: position [m], then quaternion (x, y, z, w).
+
+        Returns:
+            Shape (worlds, sensors, 7).
+        """
+        return np.asarray(self._frames.numpy(), float)
+
+    def electrode_lines(
+        self, environments: ArrayLike | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Outlines of the electrodes, for drawing, where the sensors were at the last reading.
+
+        Args:
+            environments: Of which worlds, numbers or a mask; all by default.
+
+        Returns:
+            Starts and ends of lines [m] in the worlds' frames, shape (k, 3), world by world; and
+            red, green and blue, 0 to 1, by the change of each electrode's own capacitance,
+            shape (k, 3).
+
+        Raises:
+            SceneError: There is no such world.
+        """
+        rows = chosen_rows(environments, self.fleet.count)
+        if self._segments is None:
+            rims = [e.surface.rims for e in self.design.electrodes]
+            owner = np.repeat(np.arange(len(rims)), [len(r) for r in rims])
+            self._segments = np.concatenate(rims), owner
+        segments, owner = self._segments
+        frames = self.frames()[rows][:, :, None, None]
+        axis, w = frames[..., 3:6], frames[..., 6:]
+        turn = 2.0 * np.cross(axis, segments)
+        ends = frames[..., :3] + segments + w * turn + np.cross(axis, turn)
+        change = np.diagonal(self.data.delta.numpy()[rows], axis1=-2, axis2=-1)
+        colours = signal_colours(strength(change.reshape(-1))) / 255.0
+        colours = colours.reshape(*change.shape, 3)[:, :, owner]
+        points = ends.reshape(-1, 2, 3)
+        return points[:, 0], points[:, 1], colours.reshape(-1, 3)
 
     def _fix(self, places: Fixed, sites: Fixed) -> None:
         """Say where the shapes that are seen, and the sites, are on the simulator's bodies."""
@@ -126,12 +289,193 @@ class ParallelSensors:
             inputs = [parents, number, local, out]
             wp.launch(compose, dim=out.shape, inputs=inputs, device=out.device)
 
-    def _read(self, time: float | None) -> FleetReading:
-        """The reading at the poses that stand in the two arrays."""
-        poses, frames = self._poses, self._frames
-        if self.fleet.device == "cpu":
+    def _resized(self) -> Iterable[tuple[int, NDArray[np.integer], Sequence[Body]]]:
+        """Places whose shapes have other sizes than before: place, worlds, and new bodies."""
+        return ()
+
+    def _like(self, place: int, shape: Shape) -> Body:
+        """A body of another shape in a place, of the same matter and rule."""
+        part = next(k for k, mine in enumerate(self._places) if place in mine)
+        return replace(self._matter[part], shape=shape)
+
+    def _change(self, place: int, rows: NDArray[np.integer], bodies: Sequence[Body]) -> None:
+        """Put other bodies, as of :meth:`_like`, in a place of some worlds."""
+        self.fleet.change(place, bodies, rows)
+
+    def _mask(self, environments: Any) -> Any:
+        """A mask of worlds on the simulator's device, of numbers or a mask; None for all."""
+        if environments is None:
+            return None
+        device = self._poses.device
+        if on_device(environments):
+            mask = environments
+            if not isinstance(mask, wp.array):
+                import torch
+
+                given = torch.as_tensor(environments)
+                if given.dtype != torch.bool:
+                    given = self._mask_of_numbers(given.cpu().numpy())
+                mask = wp.from_torch(given) if isinstance(given, torch.Tensor) else given
+            if mask.dtype is wp.bool and mask.shape == (self.fleet.count,):
+                return mask if mask.device == device else mask.to(device)
+            environments = mask.numpy()
+        return self._mask_of_numbers(environments)
+
+    def _mask_of_numbers(self, environments: Any) -> Any:
+        rows = chosen_rows(environments, self.fleet.count)
+        chosen = np.isin(np.arange(self.fleet.count), rows)
+        return wp.array(chosen, dtype=wp.bool, device=self._poses.device)
+
+    def _read(self, time: Any, environments: Any = None) -> FleetReading:
+        """The reading at the poses that stand in the two arrays, of some worlds or all."""
+        mask, device = self._mask(environments), self._poses.device
+        if self._drops is not None:
+            size = self._poses.shape
+            wp.launch(lower, dim=size, inputs=[self._drops, self._poses], device=device)
+        if device.is_cpu or not self._looked:
+            for change in self._resized():
+                self._change(*change)
+            self._looked = True
+        poses, frames, fleet = self._poses, self._frames, self.fleet
+        for terrain in self.terrains:
+            for place, body, rows in terrain.moved(poses.numpy(), frames.numpy()):
+                fleet.change(place, body, rows)
+        clock = time
+        if on_device(time) and fleet.device == "cpu":
+            clock = _host(time)
+        if fleet.device == "cpu":
             poses, frames = poses.numpy(), frames.numpy()
-        return self.fleet.step(poses, frames, time=time)
+        due = mask.numpy() if mask is not None and fleet.device == "cpu" else mask
+        reading = fleet.step(poses, frames, time=clock, environments=due)
+        self._record.take(reading, self._times(time), mask)
+        return reading
+
+    def _times(self, time: Any) -> Any:
+        """Times [s] of all worlds, shape (w,), NaN where none is given."""
+        if on_device(time):
+            values = time if isinstance(time, wp.array) else wp.from_torch(time)
+            if values.shape == (self.fleet.count,):
+                return values
+            time = _host(time)
+        given = np.nan if time is None else np.asarray(time, float)
+        return np.broadcast_to(given, self.fleet.count)
+
+
+Sensors = TypeVar("Sensors", bound=ParallelSensors)
+
+
+class SensorsByDesign(Mapping[str, Sensors]):
+    """Sensors of several designs on one robot, by the names of the designs."""
+
+    def __init__(self, parts: Mapping[str, Sensors]) -> None:
+        self._parts = dict(parts)
+
+    @classmethod
+    def on_carriers(
+        cls, make: Callable[[list[int], Design], Sensors], carriers: Sequence[str], design: Any
+    ) -> SensorsByDesign[Sensors]:
+        """Sensors on the bodies of some names.
+
+        Args:
+            make: Makes those of one design, of the numbers of their carriers.
+            carriers: Names of the bodies, one for each sensor.
+            design: A design for all; or a dict of name patterns and designs, of which the first
+                that fits a body is that of its sensor.
+
+        Raises:
+            SceneError: No pattern fits a body, a pattern fits none, or two designs have one name.
+        """
+        given = design if isinstance(design, Mapping) else {"*": design}
+        groups = patterns_by_design(given)
+        owner = {pattern: name for name, (_, mine) in groups.items() for pattern in mine}
+        numbers: dict[str, list[int]] = defaultdict(list)
+        for k, carrier in enumerate(carriers):
+            name = next((owner[p] for p in given if matches(p, (carrier,))), None)
+            if name is None:
+                raise SceneError(f"no design is given for {carrier!r}; add a pattern that fits it")
+            numbers[name].append(k)
+        for pattern in given:
+            if not any(matches(pattern, (carrier,)) for carrier in carriers):
+                raise SceneError(f"design: no body fits {pattern!r}; there are {list(carriers)}")
+        out = cls({name: make(mine, groups[name][0]) for name, mine in numbers.items()})
+        for name, sensors in out.items():
+            sensors.carriers = tuple(carriers[k] for k in numbers[name])
+        return out
+
+    def __getitem__(self, name: str) -> Sensors:
+        return self._parts[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    @property
+    def data(self) -> dict[str, ParallelData]:
+        """What the sensors read last, by design."""
+        return {name: sensors.data for name, sensors in self.items()}
+
+    def read(self, *state: Any, **options: Any) -> dict[str, Any]:
+        """The readings of all designs; arguments are those of the sensors' own ``read``."""
+        return {name: each.read(*state, **options) for name, each in self.items()}  # type: ignore[attr-defined]
+
+    def reset(self, environments: Any = None, *, seed: int | None = None) -> None:
+        """See :meth:`ParallelSensors.reset`."""
+        for sensors in self.values():
+            sensors.reset(environments, seed=seed)
+
+
+def patterns_by_design(
+    designs: Mapping[str, Design | str | Path],
+) -> dict[str, tuple[Design, list[str]]]:
+    """Name of each design → the design, and the name patterns of the sites that have it.
+
+    Raises:
+        SceneError: No design is given, or two have one name.
+        DesignError: A design is wrong.
+    """
+    if not designs:
+        raise SceneError("designs is empty; give a dict of site patterns and designs")
+    out: dict[str, tuple[Design, list[str]]] = {}
+    made: dict[str | Path, Design] = {}
+    for pattern, given in designs.items():
+        design = given
+        if not isinstance(design, Design):
+            design = made[design] = made[design] if design in made else load_design(design)
+        known, patterns = out.setdefault(design.name, (design, []))
+        if known is not design:
+            raise SceneError(
+                f"two designs are named {design.name!r}; give one of them another name"
+            )
+        patterns.append(pattern)
+    return out
+
+
+def _whole(what: str, value: object) -> int:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 0:
+        raise SceneError(f"{what} is {value!r}; give a whole number from 0")
+    return int(value)
+
+
+def _is_terrain(ground: Ground | None) -> bool:
+    return ground is not None and ground.is_terrain
+
+
+def _numbered(grounds: Sequence[Ground | None], sensors: int) -> list[list[int]]:
+    """Numbers of the places of each part: one, or of a terrain one for each sensor."""
+    out: list[list[int]] = []
+    first = 0
+    for ground in grounds:
+        count = sensors if _is_terrain(ground) else 1
+        out.append(list(range(first, first + count)))
+        first += count
+    return out
+
+
+def _host(values: Any) -> Any:
+    """An array on a device as one of NumPy."""
+    return values.numpy() if isinstance(values, wp.array) else values.numpy(force=True)
 
 
 def _connected(
@@ -140,7 +484,7 @@ def _connected(
     """The bodies of parts with their shares of capacitances, and which parts are one conductor."""
     free = [k for k, part in enumerate(parts) if _is_free(_some_body(part), frequency)]
     count = Counter(parts[k].owner for k in free)
-    out = [part.bodies for part in parts]
+    out: list[Any] = [part.bodies for part in parts]
     groups: dict[tuple[int, str], list[int]] = defaultdict(list)
     for k in free:
         tree, owner = parts[k].tree, parts[k].owner
@@ -170,9 +514,10 @@ def _with_share(bodies: Body | Sequence[Body | None], count: int) -> Body | Sequ
 
 def _some_body(part: WorldShape) -> Body:
     """A body that stands in a part's place in some world."""
-    if isinstance(part.bodies, Body):
-        return part.bodies
-    return next(body for body in part.bodies if body is not None)
+    bodies: Any = part.bodies
+    if isinstance(bodies, Body):
+        return bodies
+    return next(body for body in bodies if body is not None)
 
 
 def warn_left_out(names: Sequence[str], why: str) -> None:
@@ -227,3 +572,12 @@ def from_matrices(
     w, k = wp.tid()
     n = number[k]
     out[w, k] = wp.transform(position[w, n], wp.quat_from_matrix(matrix[w, n]))
+
+
+@no_type_check
+@wp.kernel(enable_backward=False)
+def lower(drops: wp.array(dtype=wp.float32), poses: wp.array2d(dtype=wp.transform)) -> None:
+    """Move poses down along their own z axes by some lengths [m]."""
+    w, k = wp.tid()
+    at = wp.transform(wp.vec3(0.0, 0.0, -drops[k]), wp.quat_identity())
+    poses[w, k] = wp.transform_multiply(poses[w, k], at)

@@ -34,6 +34,15 @@ class HalfSpace:
     """Everything below the plane z = 0 of its own frame, such as a floor."""
 
 
+def plate_thickness(domain: Domain, material: Material) -> float:
+    """Thickness [m] of the plate that stands for a half space of some matter.
+
+    A conductor's charge is on its face: its panels are better spent there than on a cube.
+    """
+    edge = float(np.linalg.norm(domain.size))
+    return edge * (_PLATE if material.is_conductor() else 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Solid:
     """One solid of a simulator, fixed to one of its moving frames."""
@@ -132,7 +141,7 @@ class World:
         taken: dict[str, int] = {}
         for i, solid in enumerate(self.solids):
             boxes[i] = 0.0 if isinstance(solid.shape, HalfSpace) else solid.shape.bounds()
-            plate = Box((edge, edge, edge * (_thickness(solid) or 1.0)))
+            plate = Box((edge, edge, plate_thickness(self.domain, solid.material)))
             shape = solid.shape if isinstance(solid.shape, Shape) else plate
             count = taken[solid.label] = taken.get(solid.label, 0) + 1
             label = solid.label if count == 1 else f"{solid.label}#{count}"
@@ -152,7 +161,7 @@ class World:
             np.array([s.pose.position for s in self.solids]).reshape(n, 3),
             np.array([s.pose.quaternion for s in self.solids]).reshape(n, 4),
             boxes.mean(axis=1), 0.5 * (boxes[:, 1] - boxes[:, 0]),
-            np.array([edge * _thickness(s) for s in self.solids]),
+            np.array([self._depth(s) for s in self.solids]),
         )  # fmt: skip
         self._lower, self._upper = self.domain.sight
         self._placed = Placed(np.empty((n, 3)), np.empty((n, 4)), np.zeros(n, dtype=np.bool_))
@@ -199,6 +208,11 @@ class World:
         pairs = zip(self.solids, self._bodies, strict=True)
         return {body.name for solid, body in pairs if solid.frame in frames}
 
+    def _depth(self, solid: Solid) -> float:
+        """Thickness [m] of the plate that stands for a half space; 0 for any other shape."""
+        half_space = isinstance(solid.shape, HalfSpace)
+        return plate_thickness(self.domain, solid.material) if half_space else 0.0
+
     def _near(self, index: int, body: Body) -> Body:
         """A body that is placed; of a terrain, the part that reaches into the domain."""
         terrain = self.solids[index].shape
@@ -243,16 +257,6 @@ class World:
             grounding = b.grounding / count
             self._tied[key] = Body(b.shape, b.pose, b.material, grounding, b.name, b.force)
         return self._tied[key]
-
-
-def _thickness(solid: Solid) -> float:
-    """Of the plate that stands for a half space, over its width; 0 for any other shape.
-
-    A conductor's charge is on its face: its panels are better spent there than on a cube.
-    """
-    if not isinstance(solid.shape, HalfSpace):
-        return 0.0
-    return _PLATE if solid.material.is_conductor() else 1.0
 
 
 def _diverged(what: str) -> SceneError:

@@ -136,7 +136,10 @@ def export(args: argparse.Namespace) -> int:
     arg("recording REC", "the recording", type=Path, nargs="?"),
     arg("--list", "list the chips; with --chip, that one's figures"),
     arg(
-        "--chip NAME", "a chip; may be repeated; 'all' for all of them", action="append", default=[]
+        "--chip NAME|FILE.toml",
+        "a chip, or a readout file; may be repeated; 'all' for all chips",
+        action="append",
+        default=[],
     ),
     arg("--config FILE.toml", "a readout file", type=Path),
     arg("--rate HZ", "conversions per second, one of the chip's", type=float),
@@ -200,8 +203,11 @@ def _check_options(args: argparse.Namespace) -> None:
         raise ReadoutError("no recording given; name the output folder of capsense run, or --list")
     if bool(args.chip) == (args.config is not None):
         raise ReadoutError("give --chip NAME or --config FILE.toml, one of them")
-    if args.config is not None and (args.rate is not None or args.seed or args.no_noise):
-        raise ReadoutError("--rate, --seed and --no-noise go with --chip; write them in the file")
+    files = args.config is not None or any(name.endswith(".toml") for name in args.chip)
+    if files and (args.rate is not None or args.seed or args.no_noise):
+        raise ReadoutError(
+            "--rate, --seed and --no-noise go with a chip's name; write them in the file"
+        )
     if args.seed < 0:
         raise ReadoutError(f"--seed {args.seed} must be zero or more")
     if args.electrode is not None and args.plot is None:
@@ -224,6 +230,9 @@ def _build(args: argparse.Namespace, recording: CapacitanceRecord) -> dict[str, 
     names = list(CHIPS) if "all" in args.chip else args.chip
     out = {}
     for name in names:
+        if name.endswith(".toml"):
+            out[Path(name).stem] = load_readout(name, recording.electrodes)
+            continue
         chip = chip_of(name)
         patterns = default_patterns(chip, recording.electrodes)
         empty = recording.empty_channels(ChannelBank(patterns, recording.electrodes))

@@ -14,7 +14,7 @@ from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
 from capsense.field.face import has_even_face
-from capsense.field.gap_table import gap_table_of
+from capsense.field.gap_table import gap_table_of, table_solution
 from capsense.field.green import GreenFunction, build_green
 
 Array = NDArray[np.float64]
@@ -118,12 +118,14 @@ def build_background(
     names, unit = tuple(terminals(design)), design.unit
     solution, densities, capacitance = solve_empty(design, settings, begin)
     green = build_green(solution, densities, begin)
+    count = len(densities)
     if has_even_face(solution.design):
+        solution = table_solution(solution, settings.panel_scale)  # the finer one is given up
         table = gap_table_of(solution, settings.panel_scale, green, begin)
         green = replace(green, gap=table)
     green = replace(green, unit=unit)
     tell("done", 1.0)
-    return BackgroundField(capacitance, names, len(densities), green)
+    return BackgroundField(capacitance, names, count, green)
 
 
 def empty_capacitance(design: Design, settings: BuildSettings | None = None) -> Array:

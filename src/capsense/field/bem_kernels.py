@@ -11,10 +11,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
-from capsense._thread_pool import filled
+from capsense._thread_pool import filled, in_parts
 from capsense.field.polygon_kernels import polygon_gradient, polygon_potential, solid_angle
 
 Array = NDArray[np.float64]
@@ -23,6 +24,8 @@ _OUTER = 1.6
 """Pairs nearer than this many sums of their diameters average the outer integral too."""
 _NEAR = 2.0
 """Panels nearer than this many of their own diameters are integrated in closed form."""
+_FAR = 4.0
+"""Panels farther than this many of their own diameters are met by their area and second moments."""
 
 
 class Panels(NamedTuple):
@@ -154,15 +157,18 @@ def potential_matrix(points: Array, floor: float, panels: Panels) -> Array:
 
     The grounded plane z = ``floor`` is met by image charges.
     """
-    out = np.empty((len(points), len(panels.centers)))
-    return filled(_fill_potentials, out, np.ascontiguousarray(points), floor, panels)
+    points, out = np.ascontiguousarray(points), np.empty((len(points), len(panels.centers)))
+    filled(_fill_far_potentials, out, points, floor, _moments(panels))
+    return filled(_fill_potentials, out, points, floor, panels)
 
 
-@kernel
+@compiled
 def _fill_potentials(start, stop, points, floor, p, out):
     for i in range(start, stop):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for j in range(out.shape[1]):
-            out[i, j] = _imaged_potential(p, j, floor, points[i, 0], points[i, 1], points[i, 2])
+            if not _is_far(p, j, x, y, z, 0.0):
+                out[i, j] = _imaged_potential(p, j, floor, x, y, z)
 
 
 def system_matrix(kind: NDArray[np.int64], contrast: Array, floor: float, panels: Panels) -> Array:
@@ -183,7 +189,14 @@ def system_block(
     rows: tuple[int, int], columns: tuple[int, int],
 ) -> Array:  # fmt: skip
     """Return the block of :func:`system_matrix` with rows and columns from … to …."""
+    some = slice(*rows)
     out = np.empty((rows[1] - rows[0], columns[1] - columns[0]))
+    moments, centers = _moments(panels, slice(*columns)), panels.centers[some]
+    filled(_fill_far_potentials, out, centers, floor, moments)
+    flux = np.flatnonzero(kind[some] == 1)
+    if len(flux):
+        turned = -contrast[some][flux, None] * panels.normals[some][flux]
+        in_parts(_fill_far_gradients, len(flux), flux, centers[flux], turned, floor, moments, out)
     return filled(_fill_system, out, (rows[0], columns[0]), kind, contrast, floor, panels)
 
 
@@ -192,15 +205,99 @@ def _fill_system(start, stop, origin, kind, contrast, floor, p, out):
     (row, column), grad = origin, np.empty(3)
     for i in range(row + start, row + stop):
         line = out[i - row]
+        x, y, z = p.centers[i, 0], p.centers[i, 1], p.centers[i, 2]
         for j in range(column, column + out.shape[1]):
             if kind[i] == 2:
                 line[j - column] = -contrast[i] * _flux_mean(p, i, j, floor)
+            elif _is_far(p, j, x, y, z, p.diameters[i]) and (
+                kind[i] == 1 or not _over_floor(p, i, j, floor)
+            ):
+                continue
             elif kind[i] == 1:
                 line[j - column] = -contrast[i] * _mean_normal_gradient(p, i, j, floor, grad)
             else:
                 line[j - column] = _mean_potential(p, i, j, floor)
         if kind[i] and 0 <= i - column < out.shape[1]:
             line[i - column] += 2.0 * math.pi
+
+
+@kernel
+def _is_far(p, j, x, y, z, diameter):
+    """Whether panel j is met by moments from a point, or from the middle of another panel."""
+    dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], z - p.centers[j, 2]
+    own = p.diameters[j]
+    reach = max(_FAR * own, _OUTER * (own + diameter) if diameter > 0.0 else 0.0)
+    return dx * dx + dy * dy + dz * dz >= reach * reach
+
+
+@kernel
+def _over_floor(p, i, j, floor):
+    """Whether panel i, so close to the floor that its width counts, is above panel j's image."""
+    dx, dy = p.centers[i, 0] - p.centers[j, 0], p.centers[i, 1] - p.centers[j, 1]
+    reach = _OUTER * (p.diameters[j] + p.diameters[i])
+    return p.diameters[i] > p.centers[i, 2] - floor and dx * dx + dy * dy < reach * reach
+
+
+def _moments(panels: Panels, some: slice = slice(None)) -> Array:
+    """Centres, areas and second moments of panels, shape (10, n).
+
+    With T = 3 Q − tr(Q) 1 of the second moments Q about the centre, the potential of unit density
+    is A/r + rᵀTr/(2 r⁵), r from the centre (J. D. Jackson, *Classical Electrodynamics*, 4.1). The
+    rows are x, y, z, A, Txx, Tyy, Tzz, Txy, Txz, Tyz.
+    """
+    centers, weights = panels.centers[some], panels.weights[some]
+    off = panels.quad[some] - centers[:, None]
+    second = np.einsum("nq,nqa,nqb->nab", weights, off, off)
+    turned = 3 * second - np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    a, b = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    return np.ascontiguousarray(np.vstack([centers.T, weights.sum(axis=1), turned[:, a, b].T]))
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _fill_far_potentials(
+    start: int, stop: int, points: Array, floor: float, moments: Array, out: Array
+) -> None:
+    cx, cy, cz, area, xx, yy, zz, xy, xz, yz = moments
+    for i in range(start, stop):
+        x, y, z, image = points[i, 0], points[i, 1], points[i, 2], 2.0 * floor - points[i, 2]
+        for j in range(out.shape[1]):
+            dx, dy, up, down = x - cx[j], y - cy[j], z - cz[j], image - cz[j]
+            flat = dx * dx * xx[j] + dy * dy * yy[j] + 2.0 * dx * dy * xy[j]
+            side = 2.0 * (dx * xz[j] + dy * yz[j])
+            across = dx * dx + dy * dy
+            s, t = 1.0 / np.sqrt(across + up * up), 1.0 / np.sqrt(across + down * down)
+            one = flat + up * (up * zz[j] + side)
+            two = flat + down * (down * zz[j] + side)
+            out[i, j] = s * (area[j] + 0.5 * one * s**4) - t * (area[j] + 0.5 * two * t**4)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _fill_far_gradients(
+    start: int, stop: int, rows: NDArray[np.int64], points: Array, normals: Array, floor: float,
+    moments: Array, out: Array,
+) -> None:  # fmt: skip
+    """Write normals · ∇ of the potentials at points into rows of ``out``."""
+    cx, cy, cz, area, xx, yy, zz, xy, xz, yz = moments
+    for k in range(start, stop):
+        i = rows[k]
+        x, y, z, image = points[k, 0], points[k, 1], points[k, 2], 2.0 * floor - points[k, 2]
+        u, v, w = normals[k]
+        for j in range(out.shape[1]):
+            dx, dy, up, down = x - cx[j], y - cy[j], z - cz[j], image - cz[j]
+            across = dx * dx + dy * dy
+            total = 0.0
+            for dz, side, sign in ((up, w, 1.0), (down, -w, -1.0)):
+                s = 1.0 / np.sqrt(across + dz * dz)
+                a = dx * xx[j] + dy * xy[j] + dz * xz[j]
+                b = dx * xy[j] + dy * yy[j] + dz * yz[j]
+                c = dx * xz[j] + dy * yz[j] + dz * zz[j]
+                along = dx * u + dy * v + dz * side
+                form = dx * a + dy * b + dz * c
+                total += sign * s**3 * (
+                    -along * area[j] + s * s * (a * u + b * v + c * side)
+                    - 2.5 * s**4 * form * along
+                )  # fmt: skip
+            out[i, j] = total
 
 
 @kernel
@@ -233,6 +330,9 @@ def normal_gradient_block(
 ) -> Array:
     """Rows of :func:`normal_gradient_matrix`, for the panels from ``first`` on."""
     out = np.empty((len(rows), len(panels.centers) - first))
+    moments = _moments(panels, slice(first, None))
+    centers, normals = panels.centers[rows], panels.normals[rows]
+    filled(_fill_far_gradients, out, np.arange(len(rows)), centers, normals, floor, moments)
     return filled(_fill_normal_gradients, out, rows, first, floor, panels)
 
 
@@ -240,8 +340,11 @@ def normal_gradient_block(
 def _fill_normal_gradients(start, stop, rows, first, floor, p, out):
     grad = np.empty(3)
     for k in range(start, stop):
-        for j in range(out.shape[1]):
-            out[k, j] = _mean_normal_gradient(p, rows[k], first + j, floor, grad)
+        i = rows[k]
+        x, y, z = p.centers[i, 0], p.centers[i, 1], p.centers[i, 2]
+        for j in range(first, first + out.shape[1]):
+            if not _is_far(p, j, x, y, z, p.diameters[i]):
+                out[k, j - first] = _mean_normal_gradient(p, i, j, floor, grad)
 
 
 def flux_matrix(points: Array, rows: NDArray[np.int64], floor: float, panels: Panels) -> Array:

@@ -48,6 +48,8 @@ _FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
 _FINEST, _COARSEST = 0.5, 8.0
 """The finest, and where the search begins, as multiples of the default sizes."""
+_SIDES = 512
+"""Point charges whose answers are found at a time."""
 POWER = 1.7
 """The number of panels goes with their size to minus this power, about."""
 
@@ -269,7 +271,8 @@ class BoundarySolution:
         self.kind = np.where(owner == INTERFACE, 1 + any(k.facets != () for k in design.layers), 0)
         matrix = kernels.system_matrix(self.kind, self.contrast, self.model.floor, panels)
         progress("boundary elements: factorising")
-        self._lu = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=True)
+        # Its transpose lies in memory as LAPACK has it, and is overwritten.
+        self._lu = scipy.linalg.lu_factor(matrix.T, overwrite_a=True, check_finite=True)
 
     def densities(self, potentials: Array, sources: Array | None = None) -> Array:
         """Total charge densities [C/m²] on all panels.
@@ -284,11 +287,11 @@ class BoundarySolution:
         if sources is not None:
             points = np.ascontiguousarray(sources)
             rhs += self._source_terms(points, self._potentials(points))
-        return UNIT * scipy.linalg.lu_solve(self._lu, rhs)
+        return UNIT * self.solve(rhs)
 
     def solve(self, sides: Array) -> Array:
         """Charge densities over 4π eps0 of right-hand sides in the order of the panels, (n, k)."""
-        return scipy.linalg.lu_solve(self._lu, sides)
+        return np.asarray(scipy.linalg.lu_solve(self._lu, sides, trans=1))
 
     def responses(self, points: Array, densities: Array) -> tuple[Array, Array]:
         """Potentials at points [m] of what charges at all of them draw, and of densities.
@@ -302,10 +305,14 @@ class BoundarySolution:
             The potentials of the charges that are drawn, without those of the point charges [V],
             shape (n, n); and of the densities [V], shape (n, k).
         """
-        points = np.ascontiguousarray(points)
         potentials = self._potentials(points)
-        drawn = self.solve(self._source_terms(points, potentials))
-        return potentials @ drawn, potentials @ (densities / UNIT)
+        drawn = np.empty((len(points), len(points)))
+        for start in range(0, len(points), _SIDES):
+            some = slice(start, start + _SIDES)
+            drawn[:, some] = potentials @ self.solve(
+                self._source_terms(points[some], potentials[some])
+            )
+        return drawn, potentials @ (densities / UNIT)
 
     def _potentials(self, points: Array) -> Array:
         """Potentials at points of unit densities, times 4π eps0, (n, 3) -> (n, panels)."""
@@ -314,13 +321,14 @@ class BoundarySolution:
     def _source_terms(self, points: Array, potentials: Array) -> Array:
         """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
         panels, floor = self.model.panels, self.model.floor
-        rhs = -potentials.T
+        rhs = np.negative(potentials).T  # as LAPACK has it
         rows = np.flatnonzero(self.model.owner == INTERFACE)
         if len(rows):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
             flux = kernels.flux_matrix(points, rows, floor, panels)
             rhs[rows] = self.contrast[rows, None] * flux.T
-        return rhs / panels.areas[:, None]
+        rhs /= panels.areas[:, None]
+        return rhs
 
     def free_densities(self, densities: Array) -> Array:
         """Free charge density [C/m²] on the panels of conductors, of total densities, (n, k)."""

@@ -17,6 +17,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
@@ -64,6 +65,10 @@ _CELL = 0.6
 """Size of the cells of the table, over the validity distance."""
 _CELLS = 16_000
 """At most about so many cells."""
+_FLAT = 0.6
+"""Smallest panels of a plane, over its distance: what it sees varies over that."""
+_PART = 500
+"""So many panels at a time have their potentials averaged."""
 _LEAST = 0.003
 """Columns that change less than this part of a terminal's own are left out."""
 
@@ -79,7 +84,9 @@ class GroundedPlane(NamedTuple):
     grounded: Array
     """… and with it at ground, (m, m): 4π eps0 = 1."""
     potential: Array
-    """Their mean potentials with each terminal at 1 V, (m, t)."""
+    """Their mean potentials with each terminal at 1 V, (m, t) …"""
+    charges: Array
+    """… and the charges that hold them at these, with the design at ground, (m, t)."""
 
 
 class PlaneResponse:
@@ -125,7 +132,27 @@ class PlaneResponse:
                 + kernels.normal_gradient_block(self._rows, model.floor, both, n) @ on_plane
             )
             out[self._rows] -= jump * gradient / (4 * math.pi)
-        return GroundedPlane(out, own / plane.areas, grounded / plane.areas, -sides[:, :-1] / UNIT)
+        areas = plane.areas
+        return GroundedPlane(
+            out, own / areas, grounded / areas, -sides[:, :-1] / UNIT,
+            -on_plane[:, :-1] * areas[:, None] / UNIT,
+        )  # fmt: skip
+
+
+def table_solution(solution: BoundarySolution, panel_scale: float) -> BoundarySolution:
+    """Boundary elements of the same design that a table can be made from: few enough of them.
+
+    What a plane changes is found on the same panels with and without it.
+
+    Args:
+        solution: The factorised boundary elements of the design.
+        panel_scale: Size of their panels, as :class:`~capsense.field.boundary.Accuracy` has it.
+    """
+    count = solution.model.panels.size
+    if count <= _MOST:
+        return solution
+    scale = max(panel_scale, 1.0) * (count / _MOST) ** (1 / POWER)
+    return BoundarySolution(solution.design, Accuracy(scale))
 
 
 def gap_table_of(
@@ -134,20 +161,14 @@ def gap_table_of(
     green: GreenFunction,
     progress: Callable[[str], None] = lambda _: None,
 ) -> GapTable:
-    """The table of a design, from coarser boundary elements where it has many.
-
-    What a plane changes is found on the same panels with and without it.
+    """The table of a design, and what compression of its cover changes.
 
     Args:
-        solution: The factorised boundary elements of the design.
-        panel_scale: Size of their panels, as :class:`~capsense.field.boundary.Accuracy` has it.
-        green: The Green's function that was fitted to them, in their lengths.
+        solution: Boundary elements, from :func:`table_solution`.
+        panel_scale: As of the Green's function.
+        green: The Green's function of the design, in their lengths.
         progress: Called with what is being done.
     """
-    count = solution.model.panels.size
-    if count > _MOST:
-        scale = max(panel_scale, 1.0) * (count / _MOST) ** (1 / POWER)
-        solution = BoundarySolution(solution.design, Accuracy(scale))
     densities = solution.densities(np.eye(solution.model.n_terminals))
     table = build_gap_table(solution, densities, green.clearance, green, progress)
     if solution.design.cover is None:
@@ -173,17 +194,18 @@ def build_gap_table(
     """
     model = solution.model
     design, heights = solution.design, np.asarray(unit * _HEIGHTS, float)
-    plane, top = plane_panels(solution, _MARGIN * unit), top_of(design)
-    plates = plates_of(plane.panels, design)
+    top = top_of(design)
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
     response, errors = PlaneResponse(solution), np.full(len(heights), np.inf)
     for k, height in enumerate(heights):
         progress(f"response to a plane: {k + 1} of {len(heights)}")
+        plane = plane_panels(solution, _MARGIN * unit, _FLAT * height)
         panels = plane.at(top + height)
         found = response.at(panels, densities)
         changes[k] = found.change[: model.sheet_panels]
         if green is not None and height >= _SOUGHT * unit:
-            errors[k] = energy_error(found, panels, plates, green)
+            errors[k] = energy_error(found, panels, plates_of(plane.panels, design), green)
+        del found
     validity = unit if green is None else valid_from(heights, errors)
     return _cells_of(solution, changes, heights, top, validity, plane.panels)
 
@@ -208,30 +230,40 @@ def energy_error(
 
     Infinite where the plane's energies by it are not definite.
     """
-    share = plane.weights / plane.weights.sum(axis=1, keepdims=True)
-
-    def means(of: Callable[[Array], Array]) -> Array:
-        values = of(plane.quad.reshape(-1, 3)).reshape(*share.shape, -1)
-        return np.asarray(np.einsum("mqk,mq->mk", values, share))
-
-    modes, potential = means(green.psi), means(green.phi0)
-    compact = found.free - modes @ modes.T
-    matrices = [0.5 * (a + a.T) for a in (compact, found.grounded)]
+    modes, potential = _means(green, plane)
+    compact, grounded = found.free - modes @ modes.T, found.grounded
     try:
-        np.linalg.cholesky(matrices[0])
+        factor = scipy.linalg.cho_factor(0.5 * (compact + compact.T), overwrite_a=True)
     except np.linalg.LinAlgError:
         return math.inf
     worst = 0.0
     for some, columns in plates:
         if len(some):
-            one, two = (
-                (
-                    phi[some, columns] * np.linalg.solve(a[np.ix_(some, some)], phi[some, columns])
-                ).sum(0)
-                for a, phi in zip(matrices, (potential, found.potential), strict=True)
-            )
-            worst = max(worst, float(np.abs(one / two - 1.0).max()))
+            phi, exact = potential[some, columns], found.potential[some, columns]
+            if len(some) == plane.size:
+                one, two = scipy.linalg.cho_solve(factor, phi), found.charges[:, columns]
+            else:
+                part = np.ix_(some, some)
+                one, two = _solved(compact[part], phi), _solved(grounded[part], exact)
+            worst = max(worst, float(np.abs((phi * one).sum(0) / (exact * two).sum(0) - 1).max()))
     return worst
+
+
+def _solved(matrix: Array, sides: Array) -> Array:
+    """Charges of panels, with what the quadrature lacks of the symmetry of their potentials."""
+    return np.asarray(np.linalg.solve(0.5 * (matrix + matrix.T), sides))
+
+
+def _means(green: GreenFunction, plane: Panels) -> tuple[Array, Array]:
+    """Mean modes ψ and potentials φ⁰ over panels, shapes (m, modes) and (m, terminals)."""
+    share = plane.weights / plane.weights.sum(axis=1, keepdims=True)
+    parts = []
+    for start in range(0, plane.size, _PART):
+        some = slice(start, start + _PART)
+        both = np.hstack(green.psi_and_phi0(plane.quad[some].reshape(-1, 3)))
+        parts.append(np.einsum("mqk,mq->mk", both.reshape(*share[some].shape, -1), share[some]))
+    means = np.concatenate(parts)
+    return means[:, : green.n_modes], means[:, green.n_modes :]
 
 
 def valid_from(heights: Array, errors: Array) -> float:

@@ -133,6 +133,17 @@ class GreenFunction:
             out[here, : table.shape[1]] += part[here, None] * values
         return out
 
+    def psi_and_phi0(self, points: Array) -> tuple[Array, Array]:
+        """:meth:`psi` and :meth:`phi0` at once, in half of the time."""
+        terminals = self.near_phi.shape[1]
+        found = self._sum(points, *(
+            np.hstack([phi, modes]) for phi, modes in (
+                (self.near_phi, self.near_modes), (self.middle_phi, self.middle_modes),
+                (self.far_phi, self.far_modes),
+            )
+        ))  # fmt: skip
+        return found[:, terminals:] / math.sqrt(self.unit), found[:, :terminals]
+
     def g(self, p: Array, q: Array) -> Array:
         """Potential at p of the design's answer to unit charges at q [1/m], (n, 3), (m, 3)."""
         images = q * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * self.unit * self.floor]

@@ -33,6 +33,17 @@ def on_device(values: Any) -> bool:
     return hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
 
 
+def host_array(values: Any) -> Any:
+    """An array of Warp, PyTorch or JAX as one of NumPy, copied from its device; others as given."""
+    if not on_device(values):
+        return values
+    values = values.cpu() if hasattr(values, "cpu") else values
+    return values.numpy() if hasattr(values, "numpy") else np.asarray(values)
+
+
+_EACH = ("choice", "scale", "inverse_susceptibility", "ground_elastance", "neutral", "slack")
+"""What :class:`Bodies` have for every environment."""
+
 _DOUBLINGS = 2
 """Panels of a body are doubled at most so often where they are wide, see :class:`BodyTable`."""
 
@@ -64,6 +75,10 @@ class Bodies(NamedTuple):
     """Whether a sensor does not see a place, shape (s, b)."""
     group: NDArray[Any]
     """Places that are joined to one conductor have the same number, shape (b,)."""
+
+    def of(self, rows: NDArray[np.int64]) -> Bodies:
+        """What stands in some of the environments, shape (k,)."""
+        return self._replace(**{name: getattr(self, name)[rows] for name in _EACH})
 
 
 class BodyTable:
@@ -125,16 +140,9 @@ class BodyTable:
         whole = as_whole(place)
         if whole is None or not 0 <= whole < self.places:
             raise SceneError(f"place is {place!r}; there are places 0 to {self.places - 1}")
-        rows = np.arange(self.count) if environments is None else np.asarray(environments).ravel()
+        rows = chosen_rows(environments, self.count)
         if not rows.size:
             return
-        if rows.dtype.kind not in "iu" or (len(rows) and not (
-            rows.min() >= 0 and rows.max() < self.count
-        )):  # fmt: skip
-            raise SceneError(
-                f"environments is {shorten(environments)}; give numbers from 0 to {self.count - 1}"
-                + (", such as np.flatnonzero(mask)" if rows.dtype.kind == "b" else "")
-            )
         each: list[Body | None]
         if isinstance(bodies, Body) or bodies is None:
             each = [bodies] * len(rows)
@@ -273,6 +281,32 @@ def require_no_gradient(what: str, values: Any) -> None:
             f"{what} is a tensor that requires gradients, which step does not follow; give "
             f"{what}.detach(), or write capsense.fleet.autograd.change(fleet, poses)"
         )
+
+
+def chosen_rows(environments: ArrayLike | None, count: int) -> NDArray[np.int64]:
+    """Numbers of environments, in the order given, shape (k,).
+
+    Args:
+        environments: Numbers, a mask of shape (e,), or None for all.
+        count: How many there are, e.
+
+    Raises:
+        SceneError: There is no such environment, or the mask is of another length.
+    """
+    if environments is None:
+        return np.arange(count)
+    rows = np.asarray(environments)
+    if rows.dtype == np.bool_ and rows.shape == (count,):
+        return np.flatnonzero(rows)
+    rows = rows.ravel()
+    if not rows.size:
+        return np.zeros(0, np.int64)
+    if rows.dtype.kind not in "iu" or rows.min() < 0 or rows.max() >= count:
+        raise SceneError(
+            f"environments is {shorten(environments)}; give numbers from 0 to {count - 1}, or a "
+            f"mask of {count}"
+        )
+    return rows.astype(np.int64)
 
 
 def checked_forces(forces: ArrayLike, shape: tuple[int, int]) -> Array:

@@ -283,14 +283,20 @@ class CpuCore:
         self._solver, self._terminals, self._table = solver, terminals, table
         self._names = names
 
-    def step(self, bodies: Array, sensors: Array, forces: Array, jacobian: bool) -> FleetReading:
+    def step(
+        self, bodies: Array, sensors: Array, forces: Array, jacobian: bool,
+        rows: NDArray[np.int64] | None = None,
+    ) -> FleetReading:  # fmt: skip
         """The reading of poses, shapes (e, b, 7) and (e, s, 7), and forces [N], shape (e, b).
+
+        ``rows`` are the numbers of these environments, shape (e,), where they are not all.
 
         Raises:
             SolveError: Some environments have no solution.
         """
         (e, b, _), s = bodies.shape, sensors.shape[1]
         solver, terminals = self._solver, self._terminals
+        table = self._table.bodies if rows is None else self._table.bodies.of(rows)
         where = _in_units(solver, bodies, sensors, forces)
         green, cover = solver.green, solver.cover
         m = green.terminals
@@ -302,12 +308,13 @@ class CpuCore:
             np.zeros(own), np.zeros(own), np.zeros((e, s)),
         )  # fmt: skip
         sensor = Sensor(green, solver.preset.threshold, solver.preset.width, cover)
-        in_parts(_step_rows, e, self._table.bodies, where, sensor, found)
-        loss = self._lossy(where, found)
+        in_parts(_step_rows, e, table, where, sensor, found)
+        loss = self._lossy(table, where, found)
         failed = np.flatnonzero(~np.isfinite(found.delta).all(axis=(1, 2, 3)))
         if len(failed):
             raise SolveError(
-                f"{len(failed)} of {e} environments have no solution, the first is {failed[0]}: "
+                f"{len(failed)} of {e} environments have no solution, the first is "
+                f"{failed[0] if rows is None else rows[failed[0]]}: "
                 "look for bodies that coincide"
             )
         unit = solver.unit
@@ -367,12 +374,12 @@ class CpuCore:
                 out[k, s] |= len(set(some["group"][loose])) > nodes
         return out
 
-    def _lossy(self, where: Poses, found: Found) -> NDArray[Any] | None:
+    def _lossy(self, bodies: Bodies, where: Poses, found: Found) -> NDArray[Any] | None:
         """Solve what has losses; the part in quadrature (e, s, m, m), None where nothing has."""
         if not found.lossy.any():
             return None
         solver, table = self._solver, self._table
-        bodies, preset = table.bodies, solver.preset
+        preset = solver.preset
         loss = np.zeros_like(found.delta)
         records, place = np.empty(table.places, BODY), np.empty(table.places, np.int64)
         for e, s in np.argwhere(found.lossy).tolist():

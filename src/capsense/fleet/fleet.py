@@ -26,14 +26,19 @@ from capsense.fleet.bodies import (
     BodyTable,
     checked_forces,
     checked_poses,
+    chosen_rows,
+    host_array,
     on_device,
     require_no_gradient,
 )
 from capsense.fleet.check import FleetCheck, by_simulator, summary
+from capsense.fleet.chips import ChipsOfSensors
 from capsense.fleet.cpu import CpuCore
-from capsense.reading import FleetReading, Reading, StepStats
+from capsense.reading import FleetReading, FleetTouch, Reading, StepStats
 from capsense.readout import Readout
+from capsense.readout.checks import chosen
 from capsense.readout.config import make_readout
+from capsense.readout.randomisation import ReadoutRandomisation
 from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body
 from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator, checked_preset
@@ -41,7 +46,6 @@ from capsense.solver.surface_solver import PRESETS, SurfaceSolver
 from capsense.solver.tree.fine_panels import WIDE
 
 if TYPE_CHECKING:
-    from capsense.fleet.warp_chips import WarpChips
     from capsense.fleet.warp_core import WarpCore
 
 Array = NDArray[np.float64]
@@ -133,9 +137,10 @@ class Fleet:
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         width = math.inf if device == "cpu" else _WIDTHS * narrowest_width(self.design)
         self.table = BodyTable(self._solver, count, len(bodies), sensors, width)
-        self.readout: Readout | None = None
-        """The readout of which every sensor has a chip, if any."""
+        self.readouts: tuple[Readout, ...] = ()
+        """The readout of which every sensor has a chip, or one for each sensor, if any."""
         self._chips: Any = None
+        self._last: FleetReading | None = None
         self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
         self._warp = None if device == "cpu" else self._on_warp(budget)
@@ -252,68 +257,117 @@ class Fleet:
 
     def use_readout(
         self,
-        readout: Readout | str | Path | None,
+        readout: Readout | str | Path | Sequence[Readout | str | Path] | None,
         *,
-        start: float | None = None,
+        start: ArrayLike | None = None,
         seed: int | None = None,
+        randomisation: ReadoutRandomisation | None = None,
     ) -> None:
         """Read every sensor through a chip of its own from now on.
 
-        All are switched on together; noise differs from chip to chip.
+        Each environment's chips have a clock of their own, see :meth:`reset`. Noise differs from
+        chip to chip.
 
         Args:
             readout: A readout for this design's electrodes, which stays as it is, the name of a
-                chip with its usual settings, the path of a readout file (``.toml``), or None.
-            start: Time at which they are switched on [s], by default 0; always 0 on Warp.
+                chip with its usual settings, the path of a readout file (``.toml``), or None; or a
+                list of such, one for each sensor of an environment, with as many channels.
+            start: Time at which they are switched on [s], a number or one for each environment; by
+                default 0.
             seed: Of all random numbers, by default the readout's own.
+            randomisation: How the chips differ from the readout and from each other, drawn anew
+                at each reset; by default not at all.
 
         Raises:
             ReadoutError: There is no such chip or file, the file is wrong, or the seed is no whole
-                number from 0 on; the readout is of other electrodes; or it has open electrodes or
-                parts of the user's own, or is not switched on at 0 s, and the fleet is on Warp.
+                number from 0 on; a readout is of other electrodes, or there are as many neither as
+                sensors nor as each other's channels; a randomisation does not fit
+                the fleet; or the readout has open electrodes or parts of the user's own, and the
+                fleet is on Warp.
         """
-        self.readout = self._chips = None
+        self.readouts, self._chips = (), None
         if readout is None:
             return
-        chip = copy.deepcopy(make_readout(readout, self))
-        if chip.bank.electrodes != self.electrode_names:
-            raise ReadoutError(
-                f"the readout is of electrodes {chip.bank.electrodes}, the fleet of "
-                f"{self.electrode_names}"
-            )
-        self._switch_on(chip, start, seed)
+        listed = isinstance(readout, Sequence) and not isinstance(readout, str)
+        chips = self._readouts(list(cast("Any", readout)) if listed else [cast("Any", readout)])
+        how: dict[str, Any] = {
+            "seed": seed, "start": 0.0 if start is None else start, "randomisation": randomisation
+        }  # fmt: skip
+        if seed is not None:
+            chips[0].reset(seed=seed)
+        if len(chips) == 1:
+            how["seed"] = chips[0].seed
+        with self._one:
+            if self._warp is not None:
+                self._chips = self._warp.chips(chips, self.baseline, how)
+            elif len(chips) == 1:
+                self._chips = SideBySide(chips[0], self.count, self.sensors, **how)
+            else:
+                self._chips = ChipsOfSensors(chips, self._of_one_sensor, **how)
+            self.readouts = tuple(chips)
 
-    def reset(self, *, start: float | None = None, seed: int | None = None) -> None:
-        """Restart the chips; a fleet keeps nothing else from step to step.
+    def _of_one_sensor(self, number: int, readout: Readout, **how: Any) -> SideBySide:
+        return SideBySide(readout, self.count, **how)
+
+    def _readouts(self, given: Sequence[Readout | str | Path]) -> list[Readout]:
+        """Copies of readouts, of one for all sensors or of one for each."""
+        chips = [copy.deepcopy(make_readout(each, self)) for each in given]
+        if len(chips) not in (1, self.sensors):
+            raise ReadoutError(
+                f"there are {len(chips)} readouts and {self.sensors} sensors; give one for all, or "
+                "one for each"
+            )
+        for chip in chips:
+            if chip.bank.electrodes != self.electrode_names:
+                raise ReadoutError(
+                    f"the readout is of electrodes {chip.bank.electrodes}, the fleet of "
+                    f"{self.electrode_names}"
+                )
+            if len(chip.bank) != len(chips[0].bank):
+                raise ReadoutError(
+                    f"readouts have {len(chips[0].bank)} and {len(chip.bank)} channels; make them "
+                    "the same"
+                )
+        return chips
+
+    @property
+    def readout(self) -> Readout | None:
+        """The readout of which every sensor, or the first, has a chip; None without chips."""
+        return self.readouts[0] if self.readouts else None
+
+    @property
+    def drawn(self) -> ReadoutRandomisation | None:
+        """What the chips' figures are now, as arrays on the host, (e, s, K); None without chips."""
+        return None if self._chips is None else self._chips.drawn
+
+    def reset(
+        self,
+        environments: ArrayLike | None = None,
+        *,
+        start: ArrayLike | None = None,
+        seed: int | None = None,
+    ) -> None:
+        """Restart the chips of some environments; a fleet keeps nothing else from step to step.
+
+        Their noise and what is randomised is drawn anew, so that no two episodes have the same;
+        with a seed, they repeat. Draws depend on the seed, the environment's number, and how
+        often it was reset since it got the seed. Other environments' chips go on as if nothing
+        had happened.
 
         Args:
-            start: Time at which they are switched on [s], by default 0; always 0 on Warp.
-            seed: Of all random numbers from now on; by default they repeat.
+            environments: Their numbers, or a mask, shape (e,); all by default.
+            start: Time at which they are switched on [s], a number or one for each of these
+                environments; by default 0.
+            seed: Of their random numbers from now on.
 
         Raises:
-            ReadoutError: The seed is no whole number from 0 on, or chips on Warp are not switched
-                on at 0 s.
+            ReadoutError: There is no such environment, the seed is no whole number from 0 on, or a
+                time is not finite.
         """
-        if self.readout is not None:
-            self._switch_on(self.readout, start, seed)
-
-    def _switch_on(self, chip: Readout, start: float | None, seed: int | None) -> None:
-        """Make chips of one kind, switched on at a time [s]."""
-        begun = 0.0 if start is None else start
-        chip.reset(start=begun, seed=seed)
-        with self._one:
-            chips: SideBySide | WarpChips
-            if self._warp is None:
-                chips = SideBySide(chip, self.count * self.sensors, seed=chip.seed)
-                chips.reset(start=begun)
-            elif begun != 0.0:
-                raise ReadoutError(
-                    f"start is {begun:g} s, but chips on Warp are switched on at 0 s; leave it out "
-                    "and let the fleet's time begin at 0"
-                )
-            else:
-                chips = self._warp.chips(chip, self.baseline, chip.seed)
-            self.readout, self._chips = chip, chips
+        rows = chosen(host_array(environments), self.count)
+        if self._chips is not None:
+            with self._one:
+                self._chips.reset(rows, start=start, seed=seed)
 
     def step(
         self,
@@ -323,6 +377,7 @@ class Fleet:
         forces: ArrayLike | None = None,
         time: Any = None,
         jacobian: bool = False,
+        environments: Any = None,
     ) -> FleetReading:
         """Return the readings of all environments.
 
@@ -338,28 +393,46 @@ class Fleet:
             forces: Normal forces that press bodies onto the design's cover [N], NaN for none,
                 where their overlap counts, shape (e, b); by default those of the bodies themselves.
                 The cover is elastic, without relaxation and hysteresis.
-            time: Time of the scenes [s], not before that of the last step; a readout needs it. On
-                Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
-                graphs.
+            time: Time of the scenes [s], a number or one for each environment, not before that of
+                its last step; a readout needs it. On Warp it may be an array on the device, of
+                shape (1,) or (e,) and single or double precision, which is not looked at.
             jacobian: Whether to work out ``reading.jacobian`` as well.
+            environments: Which environments are solved, numbers or a mask of shape (e,); all by
+                default. The reading holds for each of the others what it held last, and before its
+                first what an empty environment gives; their chips and clocks stand still. On Warp
+                it may be a mask on the device.
 
         Raises:
-            SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long;
-                there are forces and no cover, or a Jacobian is asked for with forces.
+            SceneError: There is no such environment; poses are of a wrong shape, not finite, or
+                their quaternions not 1 long; there are forces and no cover, or a Jacobian is asked
+                for with forces or of some environments.
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
         """
         if self._chips is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
         with self._one:
-            reading = self.solved(poses, sensors, forces=forces, jacobian=jacobian)
+            due = self._due(environments)
+            if self._chips is not None:
+                time = self._chips.clock(time, due)
+            reading = self.solved(
+                poses, sensors, forces=forces, jacobian=jacobian, environments=due
+            )
             if self._chips is None:
                 return reading
-            matrix = reading.delta
-            if self._warp is None:
-                matrix = reading.capacitance
-                time = np.asarray(time).item() if hasattr(time, "__dlpack__") else time
-            return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
+            matrix = reading.capacitance if self._warp is None else reading.delta
+            held = self._chips.sample(time, matrix, reading.shield_coupling, due)
+            return replace(reading, held=held)
+
+    def _due(self, environments: Any) -> Any:
+        """Which environments are solved: a mask, None for all; one on the device as it is."""
+        if environments is None:
+            return None
+        if on_device(environments):
+            if self._warp is not None:
+                return self._warp.mask(environments)
+            environments = host_array(environments)
+        return np.isin(np.arange(self.count), chosen_rows(environments, self.count))
 
     def _forces(self, forces: ArrayLike | None, jacobian: bool) -> Any:
         """Forces on the bodies [N], shape (e, b); those on a device of Warp are not looked at.
@@ -390,9 +463,13 @@ class Fleet:
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *,
-        forces: ArrayLike | None = None, jacobian: bool = False,
+        forces: ArrayLike | None = None, jacobian: bool = False, environments: Any = None,
     ) -> FleetReading:  # fmt: skip
         """As :meth:`step`, without chips and their time."""
+        if jacobian and environments is not None:
+            raise SceneError(
+                "a Jacobian is asked for of some environments; leave environments out, or jacobian"
+            )
         if jacobian and self.table.lossy:
             raise SceneError(
                 "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
@@ -403,12 +480,17 @@ class Fleet:
         if self._warp is None:
             if sensors is None:
                 sensors = np.broadcast_to(WORLD, shapes[1])
-            return self._cpu.step(
-                checked_poses("poses", poses, shapes[0]),
-                checked_poses("sensors", sensors, shapes[1]),
-                held,
+            rows = None if environments is None else np.flatnonzero(environments)
+            pick = slice(None) if rows is None else rows
+            found = self._cpu.step(
+                checked_poses("poses", poses, shapes[0])[pick],
+                checked_poses("sensors", sensors, shapes[1])[pick],
+                held[pick],
                 jacobian,
+                rows,
             )
+            self._last = found if rows is None else _with_rows(self._last_or_empty(), rows, found)
+            return self._last
         for name, each in (("poses", poses), ("sensors", sensors)):
             require_no_gradient(name, each)
         where, at = (
@@ -418,12 +500,28 @@ class Fleet:
             )
         )
         core = self._warp
-        core.solve(where, at, None if forces is None else held)
+        core.solve(where, at, None if forces is None else held, environments)
         return FleetReading(
             core.capacitance, core.delta, self.electrode_names, core.error,
             shield_coupling=core.shields,
             conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
             touch=core.touch,
+        )  # fmt: skip
+
+    def _last_or_empty(self) -> FleetReading:
+        """The last reading on the CPU; before the first, that of empty environments."""
+        if self._last is not None:
+            return self._last
+        empty, shape = self.empty, (self.count, self.sensors)
+
+        def everywhere(values: Array) -> Array:
+            return np.broadcast_to(values, (*shape, *values.shape)).copy()
+
+        each = np.zeros((*shape, len(self.baseline)))
+        touch = None if self.design.cover is None else FleetTouch(each, each, np.zeros(shape))
+        return FleetReading(
+            everywhere(empty.capacitance), everywhere(empty.delta), self.electrode_names,
+            np.zeros(shape), everywhere(empty.shield_coupling), touch=touch,
         )  # fmt: skip
 
     def check(
@@ -512,3 +610,27 @@ class Fleet:
         """
         nodes = None if self._warp is None else self._warp.gap.slots
         return self._cpu.lifted(poses, sensors, rows, nodes)
+
+
+def _with_rows(reading: FleetReading, rows: NDArray[np.int64], found: FleetReading) -> FleetReading:
+    """A reading whose rows are those of another of so many environments, but for its Jacobian."""
+
+    def merged(old: Any, new: Any) -> Any:
+        if old is None and new is None:
+            return None
+        if old is None:
+            old = np.zeros((len(reading.delta), *new.shape[1:]))
+        out = np.array(old)
+        out[rows] = 0.0 if new is None else new
+        return out
+
+    names = ("capacitance", "delta", "error", "shield_coupling", "conductance")
+    values = {name: merged(getattr(reading, name), getattr(found, name)) for name in names}
+    if reading.touch is not None and found.touch is not None:
+        parts = (merged(*both) for both in zip(_of(reading.touch), _of(found.touch), strict=True))
+        values["touch"] = FleetTouch(*parts)
+    return replace(reading, jacobian=None, held=None, **values)
+
+
+def _of(touch: FleetTouch) -> tuple[Any, Any, Any]:
+    return touch.force, touch.compression, touch.total

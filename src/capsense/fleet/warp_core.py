@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,13 @@ from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
 from capsense.fleet.bodies import Bodies, on_device
-from capsense.fleet.warp_chips import WarpChips
+from capsense.fleet.chips import ChipsOfSensors
+from capsense.fleet.warp_chips import WarpChips, registers
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
 from capsense.reading import FleetTouch
 from capsense.readout import Readout
+from capsense.readout.conversions import Held
 from capsense.solver.gap.touch_kernels import COARSE, FINE
 from capsense.solver.surface_solver import SurfaceSolver
 from capsense.solver.tree.rigid import RigidShape
@@ -137,6 +139,15 @@ class WarpCore:
         self.worlds = wp.clone(self.frames)
         """Frames of sensors that are those of the worlds."""
         self.worlds.fill_(wp.transform_identity())
+        self.due, self.some = (room(environments, dtype=wp.int32) for _ in range(2))
+        """Marks of environments to be solved: all of them, and those of a step of some."""
+        self.due.fill_(1)
+        n = terminals.electrodes
+        for out, empty in (
+            (self.capacitance, terminals.empty[:n, :n]),
+            (self.shields, terminals.empty[:n, n:].sum(axis=1)),
+        ):
+            out.assign(np.broadcast_to(empty, out.shape))
 
     def room(self, *shape: int, dtype: Any = wp.float32) -> Any:
         """An array of zeros on the device."""
@@ -206,7 +217,34 @@ class WarpCore:
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-    def solve(self, bodies: Any, sensors: Any, forces: Any) -> None:
+    def mask(self, environments: Any) -> Any:
+        """A mask of environments on the device, as an array of Warp.
+
+        Raises:
+            SceneError: It is of another shape or type, or on another device.
+        """
+        mask = environments
+        if not isinstance(mask, wp.array):
+            mask = wp.from_torch(mask) if hasattr(mask, "is_cuda") else wp.from_dlpack(mask)
+        if (mask.dtype, mask.shape, mask.device) != (wp.bool, self.due.shape, self.device):
+            raise SceneError(
+                f"environments is {mask.dtype.__name__} of shape {mask.shape} on {mask.device}; "
+                f"give a mask, bool of shape {self.due.shape}, on {self.device}, or an array of "
+                "NumPy"
+            )
+        return mask
+
+    def marks(self, mask: Any) -> Any:
+        """Marks of the environments that a mask names, of NumPy or of Warp; None for all."""
+        if mask is None:
+            return self.due
+        if isinstance(mask, np.ndarray):
+            self.some.assign(mask.astype(np.int32))
+        else:
+            self.launch(warp_cut.mark, self.counts[0], mask, self.some)
+        return self.some
+
+    def solve(self, bodies: Any, sensors: Any, forces: Any, environments: Any = None) -> None:
         """Fill :attr:`capacitance`, :attr:`delta` [F] and what else there is; waits for nothing.
 
         Args:
@@ -214,6 +252,8 @@ class WarpCore:
             sensors: The same of the sensors, shape (e, s, 7); None for the frames of the worlds.
             forces: Normal forces that press bodies onto the cover [N], NaN for none, shape (e, b);
                 None for those that they have themselves.
+            environments: Mask of the environments that are solved, of NumPy or of Warp, None for
+                all; what the others have is left as it is.
 
         Raises:
             SceneError: They are of another shape or precision, or on another device.
@@ -222,14 +262,15 @@ class WarpCore:
         bodies = as_array("poses", bodies, self.poses)
         sensors = self.worlds if sensors is None else as_array("sensors", sensors, self.frames)
         forces = self.own_forces if forces is None else as_array("forces", forces, self.forces)
+        due = self.circuit.due = self.marks(environments)
         n, views = self.cut.number.shape
         size = self.whole.shape[0]
         green, cut, circuit = self.green, self.cut, self.circuit
         at = (self.shapes, self.places)
         rows, matrix, whole = self.rows, self.matrix, self.whole
         width, stood = rows.shape[1], (self.counts[1], views)
-        self.launch(warp_cut.stand, stood, *at, green, bodies, sensors, cut)
-        self._press(forces)
+        self.launch(warp_cut.stand, stood, *at, green, due, bodies, sensors, cut)
+        self._press(forces, due)
         self._look_near()
         self.launch(warp_cut.choose, stood, *at, green, cut)
         self.launch(warp_cut.place, (3 * n, views), *at, green, cut)
@@ -265,7 +306,7 @@ class WarpCore:
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
         )  # fmt: skip
 
-    def _press(self, forces: Any) -> None:
+    def _press(self, forces: Any, due: Any) -> None:
         """Press bodies into the cover, if there is one, by forces [N], shape (e, b)."""
         if self.touch is None:
             return
@@ -278,7 +319,7 @@ class WarpCore:
         launch(warp_touch.carry, shape, cover, near, out)
         found = touch.force, touch.compression, touch.total
         size = touch.force.shape[2], shape[1]
-        launch(warp_touch.electrode_forces, size, cover, near, out, *found)
+        launch(warp_touch.electrode_forces, size, cover, near, out, due, *found)
         if self.fabric is not None:
             outlines, gap, fabric, out = self.outlines, self.gap, self.fabric, self.pressed
             seen = self.cut.node, self.cut.clusters
@@ -397,9 +438,20 @@ class WarpCore:
             warp_fabric.add_slopes, size, self.circuit, fabric, self.cut.moved, found, volts, out
         )
 
-    def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
-        """Chips for all sensors, see :class:`WarpChips`."""
-        return WarpChips(readout, (self.counts[0], self.counts[2]), empty, seed, self.device)
+    def chips(
+        self, readouts: Sequence[Readout], empty: Array, how: Mapping[str, Any]
+    ) -> WarpChips | ChipsOfSensors:
+        """Chips for all sensors, of one readout or of one each, see :class:`WarpChips`."""
+        e, _, s = self.counts
+        if len(readouts) == 1:
+            return WarpChips(readouts[0], e, s, empty, self.device, **how)
+        whole = registers(self.device, e, s, len(readouts[0].bank))
+
+        def make(number: int, readout: Readout, **own: Any) -> WarpChips:
+            part = Held(*(column[:, number : number + 1] for column in vars(whole).values()))
+            return WarpChips(readout, e, 1, empty, self.device, held=part, **own)
+
+        return ChipsOfSensors(readouts, make, registers=whole, **how)
 
     def launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:
         """Launch a kernel on the device."""

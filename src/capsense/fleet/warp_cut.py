@@ -200,11 +200,22 @@ def idle(cut: WarpActiveTree, phi_columns: int, first: int, v: int):
 
 
 @wp.kernel
+def mark(mask: wp.array(dtype=wp.bool), due: wp.array(dtype=wp.int32)):
+    """Marks of the environments that a mask names."""
+    e = wp.tid()
+    due[e] = wp.where(mask[e], 1, 0)
+
+
+@wp.kernel
 def stand(
-    shapes: Shapes, places: Places, green: Response, bodies: wp.array2d(dtype=wp.transform),
-    sensors: wp.array2d(dtype=wp.transform), cut: WarpActiveTree,
+    shapes: Shapes, places: Places, green: Response, due: wp.array(dtype=wp.int32),
+    bodies: wp.array2d(dtype=wp.transform), sensors: wp.array2d(dtype=wp.transform),
+    cut: WarpActiveTree,
 ):  # fmt: skip
-    """Where bodies stand in the sensors' frames, and which of them a sensor sees."""
+    """Where bodies stand in the sensors' frames, and which of them a sensor sees.
+
+    In environments that are not due it sees none.
+    """
     b, v = wp.tid()
     e = v // sensors.shape[1]
     s = v % sensors.shape[1]
@@ -212,7 +223,7 @@ def stand(
     o = b * cut.clusters
     cut.node[o, v] = -1
     cut.number[o, v] = -1
-    if u < 0 or places.hidden[s, b] != 0:
+    if u < 0 or places.hidden[s, b] != 0 or due[e] == 0:
         return
     frame = _unit(sensors[e, s])
     body = _unit(bodies[e, b])

@@ -36,6 +36,7 @@ class Circuit:
     empty_maxwell: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
     empty: wp.array2d(dtype=wp.float64)  # that of the driven ones, the others eliminated, (k, k)
     screened: wp.array2d(dtype=wp.float32)  # bound of what an entry changes by [F], (t, t)
+    due: wp.array(dtype=wp.int32)  # whether an environment is reported, (e,)
 
 
 @wp.kernel
@@ -170,6 +171,8 @@ def report(
     i, v = wp.tid()
     e = v // delta.shape[1]
     s = v % delta.shape[1]
+    if circuit.due[e] == 0:
+        return
     for j in range(circuit.electrodes):
         value = whole[i, j, v]
         capacitance[e, s, i, j] = wp.float32(value[0])

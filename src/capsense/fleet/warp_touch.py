@@ -254,13 +254,16 @@ def carry(cover: WarpFoundation, near: NearBodies, out: CoverContacts):
 @wp.kernel
 def electrode_forces(
     cover: WarpFoundation, near: NearBodies, contacts: CoverContacts,
-    force: wp.array3d(dtype=wp.float32), compression: wp.array3d(dtype=wp.float32),
+    due: wp.array(dtype=wp.int32), force: wp.array3d(dtype=wp.float32),
+    compression: wp.array3d(dtype=wp.float32),
     total: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
     """Force above each electrode [N] and largest compression there [m]; and that of all [N]."""
     i, v = wp.tid()
     e = v // near.sensors
     s = v % near.sensors
+    if due[e] == 0:
+        return
     limit = cover.strain[cover.strain.shape[0] - 1] * (cover.upper[2] - cover.lower[2])
     own = float(0.0)
     whole = float(0.0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import runpy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from capsense._validate import read_toml
 from capsense.errors import ScenarioError
 from capsense.learning.shards import KEY, DataSet, files_named, write_json, write_table
+from capsense.readout.calibration import LinearSensor
 from capsense.recording.tables import replacing
 from capsense.scenario import ScenarioTable
 
@@ -34,7 +35,7 @@ TOP_KEYS = (
 )  # fmt: skip
 RANDOM = "random"
 """The policy that draws from the space of actions."""
-_FORMAT = 1
+_FORMAT = 2
 """Goes up when the same file comes to mean other episodes or columns."""
 VERSION = "v3.0"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -103,7 +104,8 @@ class Episodes(DataSet):
         """What LeRobot is told of the columns, by name; and frames a second.
 
         Beside observations and actions: reward, whether the episode ends, and the numbers among
-        the facts that the first step tells, all of what follows the action (``next.…``).
+        the facts that the first step tells, all of what follows the action (``next.…``); what
+        was drawn for the episode (``drawn.…``), with the seed that the environment was reset with.
         """
         env = self.make()
         env.reset(seed=0)
@@ -120,6 +122,9 @@ class Episodes(DataSet):
             if np.ndim(value) == 0 and isinstance(value, bool | int | float | np.number | np.bool_):
                 kind = "bool" if isinstance(value, bool | np.bool_) else "float32"
                 out[f"next.{name}"] = _feature(kind)
+        for name, drawn in _drawn(world).items():
+            out[f"drawn.{name}"] = _feature("float32", len(drawn))
+        out["drawn.seed"] = _feature("int64")
         env.close()
         out |= {name: _feature(kind) for name, kind in NUMBERED.items()}
         return out, round(world.metadata["render_fps"])
@@ -243,7 +248,9 @@ class Episodes(DataSet):
     def _episode(self, number: int, env: Any, policy: Policy | None) -> dict[str, Array]:
         """An episode, which depends on the settings and its number alone."""
         rng = np.random.default_rng(np.random.SeedSequence((self.seed, number)))
-        observation, _ = env.reset(seed=int(rng.integers(2**31)))
+        seed = int(rng.integers(2**31))
+        observation, _ = env.reset(seed=seed)
+        drawn = {**_drawn(env.unwrapped), "seed": np.array([seed])}
         rows: dict[str, list[Any]] = {n: [] for n in self.columns[0] if n not in NUMBERED}
         over = cut = False
         while not (over or cut):
@@ -253,8 +260,9 @@ class Episodes(DataSet):
             observation, reward, over, cut, facts = env.step(action)
             told = {"reward": reward, "done": over or cut, **facts}
             for name, values in rows.items():
-                if name.startswith("next."):
-                    values.append(told[name.removeprefix("next.")])
+                kind, _, what = name.partition(".")
+                if kind in ("next", "drawn"):
+                    values.append(told[what] if kind == "next" else drawn[what])
         return {name: np.asarray(values) for name, values in rows.items()}
 
     def _action(self, observation: Array, space: Any, policy: Policy | None, rng: Generator) -> Any:
@@ -299,6 +307,25 @@ def load_episodes(path: str | Path) -> Episodes:
 def _feature(kind: str, size: int = 1, names: Sequence[str] | None = None) -> dict[str, Any]:
     """What is told of a column: its type, how many numbers it has, and their names."""
     return {"dtype": kind, "shape": [size], "names": None if names is None else list(names)}
+
+
+def _drawn(world: Any) -> dict[str, Array]:
+    """What an environment has drawn for this episode, where it tells it: rows of numbers by name.
+
+    Those of this package tell it as a dataclass, ``drawn``; and the gains of their chips.
+    """
+    if not is_dataclass(drawn := getattr(world, "drawn", None)):
+        return {}
+    numbers = {f.name: getattr(drawn, f.name) for f in fields(drawn)}
+    out = {n: np.array([v], float) for n, v in numbers.items() if isinstance(v, int | float)}
+    signals = getattr(world, "signals", None)
+    gains = [
+        np.broadcast_to(stage.gain, len(chip.channel_names))
+        for chip in (signals.readouts.values() if signals else ())
+        for stage in chip.stages
+        if isinstance(stage, LinearSensor)
+    ]
+    return out | ({"chip_gain": np.concatenate(gains)} if gains else {})
 
 
 def _numbers(file: int) -> dict[str, int]:

@@ -9,19 +9,25 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numpy.random import Generator
 
 from capsense._validate import read_toml
 from capsense.cover import Cover
 from capsense.design import Design
-from capsense.errors import MeshError, ScenarioError, SceneError, SolveError
-from capsense.humans import Build, arm, leg
+from capsense.errors import MeshError, ReadoutError, ScenarioError, SceneError, SolveError
+from capsense.humans import Build, Limb, arm, leg
+from capsense.learning.chips import ChipSource, padded
+from capsense.learning.columns import (
+    COLUMNS,
+    DRAWN,
+    Column,
+    body_columns,
+    columns_for,
+    schema_of,
+)
+from capsense.learning.draws import PREFIX, Draw, alternatives, columns_of
 from capsense.learning.labels import Near, Outline
 from capsense.learning.shards import DataSet, files_named
-from capsense.reading import Reading
-from capsense.readout import Readout
-from capsense.readout.config import make_readout
-from capsense.readout.conversions import Held
+from capsense.readout.randomisation import FIGURES
 from capsense.scenario import (
     ScenarioTable,
     read_body,
@@ -35,7 +41,7 @@ from capsense.simulator import DEFAULT_PRESET, PresetName, Simulator, checked_pr
 
 TOP_KEYS = (
     "name", "description", "design", "scenes", "shard_size", "seed", "preset", "readout",
-    "clearance", "body",
+    "clearance", "body", "randomisation",
 )  # fmt: skip
 LIMBS = {"arm": arm, "leg": leg}
 """Shapes that are limbs of people, beside those of scenarios."""
@@ -43,30 +49,8 @@ LIMB_KEYS = (
     "name", "shape", "material", "grounding", "pose", "sex", "percentile", "girth", "side",
     "segment", "angles",
 )  # fmt: skip
-_FORMAT = 1
+_FORMAT = 2
 """Goes up when the same file comes to mean other scenes or columns."""
-COLUMNS = {
-    "scene": "number of the scene",
-    "capacitance": "Maxwell capacitance matrix, row by row, M × M, F",
-    "delta": "its change from the empty scene, row by row, M × M, F",
-    "self_delta": "change of the self capacitances, the design's shields driven along, M, F",
-    "code": "what the converter of each channel holds, K, codes",
-    "code_delta": "what its user makes of it, change from the empty scene, K, F",
-    "distance": "from the nearest electrode to the nearest body, m",
-    "closest_point": "the point of that body's surface nearest to the electrodes, x, y, z, m",
-    "normal": "unit normal of its surface there, out of the body, x, y, z",
-    "axis": "unit vector along it, where it is a capsule or a cylinder, x, y, z",
-    "body": "its name",
-    "material": "its material",
-    "eps_r": "relative permittivity of that",
-    "sigma": "conductivity of that, S/m",
-    "bodies": "how many bodies the scene holds",
-    "touch_force": "force that the cover carries above each electrode, M, N",
-    "touch_compression": "largest compression of the cover above each electrode, M, m",
-    "touch_total": "force that the whole cover carries, N",
-}
-"""Columns, and what they are; those of a readout only where one is given, those of touch only where
-the design has a cover."""
 _TRIES = 1000
 """A scene is drawn so many times at most until nothing touches the sensor."""
 
@@ -78,8 +62,10 @@ class Spec(DataSet):
     unit = "scenes"
     design: Design
     preset: PresetName
-    readout: str | None
-    """Name of a chip, or a file, which ends in ``.toml``."""
+    readout: str | Mapping[str, Any] | None
+    """Name of a chip, or a file, which ends in ``.toml``; or a table as such a file holds it."""
+    randomisation: Mapping[str, Any] | None
+    """How the figures of chips scatter: the table of that name, as it stands in the file."""
     clearance: float
     """No body comes nearer to the sensor than this [m]."""
     bodies: tuple[Mapping[str, Any], ...]
@@ -94,6 +80,7 @@ class Spec(DataSet):
             "readout": self.readout, "clearance": self.clearance, "bodies": list(self.bodies),
             "files": files_named(_texts([*self.bodies, self.readout]), self.folder),
             **({} if self.design.cover is None else {"cover": mechanics(self.design.cover)}),
+            **({} if self.randomisation is None else {"randomisation": self.randomisation}),
         }  # fmt: skip
 
     def file(self, shard: int) -> str:
@@ -110,52 +97,85 @@ class Spec(DataSet):
         """
         import pyarrow as pa
 
-        simulator, readout = self._sensor()
-        rows = [self._row(number, simulator, readout) for number in self.numbers(shard)]
-        electrodes = len(simulator.electrode_names)
-        channels = 0 if readout is None else len(readout.channel_names)
-        number, three = pa.float64(), pa.list_(pa.float64(), 3)
-        matrix = pa.list_(number, electrodes**2)
-        kinds = {
-            "scene": pa.int64(), "capacitance": matrix, "delta": matrix,
-            "self_delta": pa.list_(number, electrodes),
-            "code": pa.list_(pa.int64(), channels), "code_delta": pa.list_(number, channels),
-            "closest_point": three, "normal": three, "axis": three,
-            "body": pa.string(), "material": pa.string(), "bodies": pa.int64(),
-            "touch_force": pa.list_(number, electrodes),
-            "touch_compression": pa.list_(number, electrodes),
-        }  # fmt: skip
-        missing: tuple[str, ...] = () if channels else ("code",)
-        missing += () if self.design.cover is not None else ("touch",)
-        names = [name for name in COLUMNS if not name.startswith(missing)]
-        schema = pa.schema(
-            pa.field(n, kinds.get(n, number), metadata={"meaning": COLUMNS[n]}) for n in names
-        )
-        return pa.Table.from_pylist(rows, schema=schema)
+        simulator = Simulator(self.design, preset=self.preset)
+        rows = [self._row(number, simulator) for number in self.numbers(shard)]
+        return pa.Table.from_pylist(rows, schema=schema_of(self.columns()))
 
     def about(self) -> dict[str, Any]:
         """What the manifest says of the sensor and the columns."""
-        simulator, readout = self._sensor()
+        simulator, chips = Simulator(self.design, preset=self.preset), self.chips
         return {
             "design": self.design.name, "electrodes": simulator.electrode_names,
-            "baseline_F": simulator.baseline.tolist(),
-            "channels": () if readout is None else readout.channel_names, "columns": COLUMNS,
+            "baseline_F": simulator.baseline.tolist(), "bodies": self.slots,
+            "channels": () if chips is None else chips.channel_names,
+            "columns": {n: c.meaning for n, c in self.columns().items()},
         }  # fmt: skip
 
-    def _sensor(self) -> tuple[Simulator, Readout | None]:
-        """The simulator, and the readout if there is one.
+    @cached_property
+    def chips(self) -> ChipSource | None:
+        """Where the chips come from; None without a readout.
 
         Raises:
             ReadoutError: There is no such chip or file, or the file is wrong.
+            ScenarioError: What should be random is written wrongly.
         """
-        simulator, choice = Simulator(self.design, preset=self.preset), self.readout
-        if choice is not None and choice.endswith(".toml"):
-            return simulator, make_readout(self.folder / choice, simulator)
-        return simulator, None if choice is None else make_readout(choice, simulator)
+        if self.readout is None:
+            return None
+        electrodes = self.design.electrode_names
+        return ChipSource(self.readout, self.randomisation, self.folder, self.source, electrodes)
 
-    def _row(self, number: int, simulator: Simulator, readout: Readout | None) -> dict[str, Any]:
+    @cached_property
+    def slots(self) -> tuple[str, ...]:
+        """Names of the bodies that there may be, in the order of the columns; B of them."""
+        names: dict[str, None] = {}
+        for raw in self.bodies:
+            for shape in alternatives(raw.get("shape")):
+                limb = LIMBS[shape](Build(), "right") if shape in LIMBS else None
+                some = [str(raw["name"])] if limb is None else _names(limb, str(raw["name"]))
+                names.update(dict.fromkeys(some))
+        return tuple(names)
+
+    def columns(self) -> dict[str, Column]:
+        """All columns, by name."""
+        chips, m, b = self.chips, len(self.design.electrode_names), len(self.slots)
+        k = 0 if chips is None else len(chips.channel_names)
+        absent: list[str] = []
+        if chips is None:
+            absent += ["code", "code_delta", "chip", "chip_seed"]
+        if chips is None or not chips.dac_bits:
+            absent.append("dac_errors")
+        if chips is None or not chips.scatters:
+            absent += [f"chip_{name}" for name in FIGURES]
+        if self.design.cover is None:
+            absent += [name for name in COLUMNS if name.startswith("touch_")]
+        bits = 0 if chips is None else chips.dac_bits
+        out = {n: c for n, c in columns_for(m, k, b, bits).items() if n not in absent}
+        return out | self._drawn_columns()
+
+    def _drawn_columns(self) -> dict[str, Column]:
+        """Columns of what is random in the file.
+
+        Raises:
+            ScenarioError: It is written wrongly, or one column would hold several kinds.
+        """
+        out: dict[str, Column] = {}
+        found = [] if self.chips is None else [*self.chips.columns.items()]
+        for raw in self.bodies:
+            table, path = _item(raw, self.source)
+            if table.number("chance", 0.0, 1.0, 1.0) < 1.0:
+                found.append((f"{PREFIX}{path}.present", bool))
+            found += columns_of({k: v for k, v in raw.items() if k != "chance"}, table, path)
+        for name, kind in found:
+            if out.setdefault(name, DRAWN[kind]) != DRAWN[kind]:
+                raise ScenarioError(
+                    f"{self.source}: {name.removeprefix(PREFIX)} is now a number and now a text; "
+                    "give options of one kind"
+                )
+        return out
+
+    def _row(self, number: int, simulator: Simulator) -> dict[str, Any]:
         """The columns of a scene that are not null."""
-        scene, near, rng = self.scene(number)
+        scene, near, draw = self.scene(number)
         try:
             reading = simulator.step(scene)
         except (SceneError, SolveError) as error:
@@ -165,13 +185,18 @@ class Spec(DataSet):
             "capacitance": reading.capacitance.ravel(),
             "delta": reading.delta.ravel(),
             "self_delta": reading.self_capacitance - simulator.empty.self_capacitance,
-            "bodies": len(scene),
-        }
-        if readout is not None:
-            readout.reset(seed=int(rng.integers(2**63)))
-            empty = settled(readout, simulator.empty, 0.0)
-            held = settled(readout, reading, settling(readout))
+            "bodies": len(scene), **body_columns(scene, self.slots),
+        }  # fmt: skip
+        if self.chips is not None:
+            try:
+                chip = self.chips.draw(draw.rng, simulator.empty)
+                empty, held, columns = chip.registers(simulator.empty, reading)
+            except ReadoutError as error:
+                raise ReadoutError(f"scene {number}: {error}") from None
+            if "dac_errors" in columns:
+                columns["dac_errors"] = padded(columns["dac_errors"], self.chips.dac_bits)
             row |= {"code": held.code, "code_delta": held.capacitance - empty.capacitance}
+            row |= columns
         if reading.touch is not None:
             touch = reading.touch
             row |= {
@@ -185,42 +210,42 @@ class Spec(DataSet):
                 "axis": near.axis, "body": near.body.name, "material": matter.name,
                 "eps_r": matter.eps_r, "sigma": matter.sigma,
             }  # fmt: skip
-        return row
+        return row | draw.drawn
 
     @cached_property
     def outline(self) -> Outline:
         """Where the sensor's surfaces are."""
         return Outline(self.design)
 
-    def scene(self, number: int) -> tuple[Scene, Near | None, Generator]:
+    def scene(self, number: int) -> tuple[Scene, Near | None, Draw]:
         """A scene, which depends on the file's settings, the seed and its number alone.
 
         Returns:
             The scene in the sensor frame; what of it is nearest to the electrodes, if anything is
-            there; and the generator that drew it, for what else is random about it.
+            there; and what was drawn, with the generator for what else is random about it.
 
         Raises:
             ScenarioError: A table is wrong, or whatever is drawn touches the sensor.
         """
         rng = np.random.default_rng(np.random.SeedSequence((self.seed, number)))
         for _ in range(_TRIES):
-            scene = Scene(b for raw in self.bodies for b in self._drawn(raw, rng))
+            draw = Draw(rng)
+            scene = Scene(b for raw in self.bodies for b in self._drawn(raw, draw))
             near = self.outline.nearest(scene)
             free = [b for b in scene if b.force is None]
             if near is None or self.outline.gap(free) >= self.clearance:
-                return scene, near, rng
+                return scene, near, draw
         raise ScenarioError(
             f"{self.source}: scene {number} came within clearance = {self.clearance:g} m of the "
             f"sensor in {_TRIES} draws; move the bodies away, or lower the clearance"
         )
 
-    def _drawn(self, raw: Mapping[str, Any], rng: Generator) -> list[Body]:
+    def _drawn(self, raw: Mapping[str, Any], draw: Draw) -> list[Body]:
         """The bodies that a table stands for, in one scene."""
-        table = ScenarioTable(raw, self.source, f'body "{raw.get("name")}"')
-        chance = table.number("chance", 0.0, 1.0, 1.0)
-        if rng.random() >= chance:
+        table, path = _item(raw, self.source)
+        if not draw.happens(table.number("chance", 0.0, 1.0, 1.0), f"{path}.present"):
             return []
-        data = {k: _draw(v, rng, table) for k, v in raw.items() if k != "chance"}
+        data = draw.table({k: v for k, v in raw.items() if k != "chance"}, table, path)
         table = ScenarioTable(data, self.source, table.item)
         try:
             if data.get("shape") in LIMBS:
@@ -276,13 +301,37 @@ def load_spec(path: str | Path) -> Spec:
         shard_size=top.integer("shard_size", 1, 10**6, 1000),
         seed=top.integer("seed", 0, 2**63 - 1, 0),
         preset=checked_preset(top.choice("preset", get_args(PresetName), DEFAULT_PRESET)),
-        readout=top.string("readout") if "readout" in top else None,
+        readout=_readout(top), randomisation=_randomisation(top),
         clearance=top.length("clearance", 1e-3), bodies=bodies,
         source=file.name, folder=folder,
     )  # fmt: skip
+    spec.columns()  # raises where a chip is wrong
     for number in range(min(10, spec.count)):
         spec.scene(number)
     return spec
+
+
+def _readout(top: ScenarioTable) -> str | dict[str, Any] | None:
+    """What ``readout`` says: a name, a file or a table."""
+    if "readout" not in top:
+        return None
+    given = top.raw("readout", "a chip, a readout file, or a table [readout]")
+    return dict(given) if isinstance(given, Mapping) else top.string("readout")
+
+
+def _randomisation(top: ScenarioTable) -> dict[str, Any] | None:
+    if "randomisation" not in top:
+        return None
+    if "readout" not in top:
+        raise top.error("randomisation is of the chip's figures; give a readout, too")
+    given = top.raw("randomisation", "a table [randomisation]")
+    return dict(ScenarioTable(given, top.source, "randomisation").data)
+
+
+def _item(raw: Mapping[str, Any], source: str) -> tuple[ScenarioTable, str]:
+    """The table of a body, and the beginning of its columns' names."""
+    name = raw.get("name")
+    return ScenarioTable(raw, source, f'body "{name}"'), f"body.{name}"
 
 
 def mechanics(cover: Cover) -> dict[str, Any]:
@@ -301,44 +350,6 @@ def _texts(value: Any) -> Iterator[str]:
     elif isinstance(value, Mapping | list):
         for item in value.values() if isinstance(value, Mapping) else value:
             yield from _texts(item)
-
-
-def _draw(value: Any, rng: Generator, table: ScenarioTable) -> Any:
-    """A value with everything random in it decided.
-
-    ``{ from = a, to = b }`` is a number, ``{ any = [...] }`` one of several, and
-    ``quaternion = "uniform"`` any orientation.
-    """
-    if isinstance(value, list):
-        return [_draw(v, rng, table) for v in value]
-    if not isinstance(value, Mapping):
-        return value
-    if "any" in value:
-        options = value["any"]
-        if len(value) > 1 or not isinstance(options, list) or not options:
-            raise table.error(f"{dict(value)} must be {{ any = [one, another, …] }}")
-        return _draw(options[rng.integers(len(options))], rng, table)
-    if "from" in value or "to" in value:
-        return _number(ScenarioTable(value, table.source, f"{table.item}: {{ from, to }}"), rng)
-    out = {k: _draw(v, rng, table) for k, v in value.items()}
-    if out.get("quaternion") == "uniform":
-        four = rng.standard_normal(4)
-        out["quaternion"] = (four / np.linalg.norm(four)).tolist()
-    return out
-
-
-def _number(span: ScenarioTable, rng: Generator) -> float:
-    """A number between two; with ``log`` uniform in its logarithm, with ``steps`` one of so many.
-
-    Steps suit sizes: a body of new proportions takes the solver many times as long as others.
-    """
-    span.only(("from", "to", "log", "steps"))
-    log = span.boolean("log", False)
-    low = span.number("from", 1e-300 if log else -1e12, 1e12)
-    high = span.number("to", low, 1e12)
-    steps = span.integer("steps", 2, 10**6, 0)
-    share = rng.integers(steps) / (steps - 1) if steps else rng.random()
-    return float(low * (high / low) ** share if log else low + (high - low) * share)
 
 
 def _limb(table: ScenarioTable) -> list[Body]:
@@ -364,18 +375,11 @@ def _limb(table: ScenarioTable) -> list[Body]:
     grounding = read_grounding(table, 100e-12)
     material = read_material(table, "human")
     bodies = limb.bodies(root, bent, degrees=True, material=material, grounding=grounding)
-    name = table.string("name")
-    short = len(limb.name) + 1
-    return [Body(b.shape, b.pose, b.material, b.grounding, f"{name}_{str(b.name)[short:]}", b.force)
-            for b in bodies]  # fmt: skip
+    names = _names(limb, table.string("name"))
+    return [Body(b.shape, b.pose, b.material, b.grounding, name, b.force)
+            for name, b in zip(names, bodies, strict=True)]  # fmt: skip
 
 
-def settling(readout: Readout) -> float:
-    """Time after which every channel has reported what it sees now [s]."""
-    return 2 * readout.schedule.period + readout.schedule.lag
-
-
-def settled(readout: Readout, reading: Reading, start: float) -> Held:
-    """The registers after a reading has stood from ``start`` [s] for the time of settling."""
-    readout.sample(start, reading)
-    return readout.sample(start + settling(readout), reading).held()
+def _names(limb: Limb, name: str) -> list[str]:
+    """What the bodies of a limb are called in a data set, in which it has a name of its own."""
+    return [f"{name}_{str(b.name)[len(limb.name) + 1 :]}" for b in limb.bodies()]

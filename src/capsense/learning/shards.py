@@ -8,17 +8,17 @@ import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
-from multiprocessing import get_context
 from pathlib import Path
 from secrets import token_hex
 from typing import Any, ClassVar
 
 from capsense._thread_pool import processors
+from capsense._workers import process_pool
 from capsense.errors import AdapterError, ScenarioError, require_package
 from capsense.recording import versions
 from capsense.recording.tables import replacing
@@ -190,7 +190,7 @@ def _made(
     elif workers <= 1:
         yield from map(job, todo)
     else:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        with process_pool(workers) as pool:
             try:
                 for future in as_completed([pool.submit(job, shard) for shard in todo]):
                     yield future.result()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsense.errors import ReadoutError
-from capsense.readout.checks import Array, Bools, Ints, finite, per_channel, real, require
+from capsense.readout.checks import Array, Bools, Ints, finite, real, require
 from capsense.readout.noise import Context, Flicker, Process
 
 _ALIKE, _FINE, _APART = 4, 30.0, 4.0
@@ -125,7 +125,8 @@ class LinearSensor:
     """
 
     gain: Array
-    """Shape (K,), or a number for all channels, as the others."""
+    """Shape (K,), or a number for all channels, as the others; in a fleet also (sensors, K) or
+    (environments, sensors, K)."""
     offset: Array
     """At the epoch [F]."""
     drift: Array
@@ -170,16 +171,89 @@ class LinearSensor:
         Raises:
             ReadoutError: There are figures for another number of channels.
         """
-        gain, offset, drift = (
-            per_channel("calibration", name, getattr(self, name), context.channels)
-            for name in ("gain", "offset", "drift")
-        )
-        return partial(self._apply, gain, offset, drift)
+        return partial(self._apply, *self.figures(context))
+
+    def figures(self, context: Context) -> tuple[Array, Array, Array]:
+        """Gain, offset and drift of all channels, each of shape (channels,).
+
+        Raises:
+            ReadoutError: There are figures for another number of channels.
+        """
+        names = ("gain", "offset", "drift")
+        found = (context.figures("calibration", name, getattr(self, name)) for name in names)
+        return tuple(found)  # type: ignore[return-value]
 
     def _apply(
         self, gain: Array, offset: Array, drift: Array, channel: Ints, time: Array, value: Array
     ) -> Array:
         return value * gain[channel] + offset[channel] + drift[channel] * (time - self.epoch)
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseCurve:
+    """How a sensor that is not linear measures: a curve through points, straight between them.
+
+    Beyond the points, the first and the last piece go on. As a stage of a readout it makes the
+    simulated sensor measure like the real one.
+
+    Raises:
+        ReadoutError: Points are not finite or fewer than two, true values do not rise, or the
+            arrays do not fit each other.
+    """
+
+    true: Array
+    """True capacitances of the points, rising [F], shape (P,), or (K, P) for each channel; in a
+    fleet also (sensors, K, P) or (environments, sensors, K, P)."""
+    measured: Array
+    """What is measured there [F], of a shape that fits."""
+
+    def __post_init__(self) -> None:
+        for name in ("true", "measured"):
+            object.__setattr__(self, name, finite(f"curve: {name}", getattr(self, name)))
+        shapes = self.true.shape, self.measured.shape
+        if not all(shapes) or shapes[0][-1] != shapes[1][-1] or shapes[0][-1] < 2:
+            raise ReadoutError(
+                f"curve: true has shape {shapes[0]}, measured {shapes[1]}; give at least two "
+                "points, as many in both"
+            )
+        if (np.diff(self.true) <= 0).any():
+            raise ReadoutError("curve: true values do not rise; sort the points")
+
+    def start(self, context: Context) -> Process:
+        """The process of a readout's stage.
+
+        Raises:
+            ReadoutError: There are curves for another number of channels.
+        """
+        return partial(_follow, *self.points(context))
+
+    def toml(self) -> str:
+        """The points as the table ``[curve]`` of a readout file."""
+        lines = [f"{key} = {getattr(self, key).tolist()}" for key in ("true", "measured")]
+        return "\n".join(["[curve]", *lines, ""])
+
+    def points(self, context: Context) -> tuple[Array, Array]:
+        """The points of all channels, true and measured [F], each of shape (channels, P).
+
+        Raises:
+            ReadoutError: There are curves for another number of channels.
+        """
+        out = []
+        for name in ("true", "measured"):
+            columns = np.moveaxis(getattr(self, name), -1, 0)
+            found = [context.figures("curve", name, column) for column in columns]
+            out.append(np.stack(found, axis=1))
+        return out[0], out[1]
+
+
+def _follow(true: Array, measured: Array, channel: Ints, time: Array, value: Array) -> Array:
+    """Values on the curves of channels."""
+    x, y = true[channel], measured[channel]
+    piece = np.sum(value[:, None] >= x[:, 1:-1], axis=1)
+    rows = np.arange(len(value))
+    start, low = x[rows, piece], y[rows, piece]
+    slope = (y[rows, piece + 1] - low) / (x[rows, piece + 1] - start)
+    return low + (value - start) * slope
 
 
 @dataclass(frozen=True, eq=False)

@@ -289,7 +289,10 @@ class ChannelBank:
         """Which channels are differences of two measurements, shape (K,)."""
         return np.array([p.minus is not None for p in self.patterns])
 
-    def values(self, capacitance: Array, shield_coupling: Array | None = None) -> Array:
+    def values(
+        self, capacitance: Array, shield_coupling: Array | None = None,
+        connected: NDArray[np.bool_] | None = None,
+    ) -> Array:  # fmt: skip
         """Capacitance of every channel.
 
         A channel's value is ``±Σ_s w_s Σ_j C_sj v_j``: plus for a self measurement, minus for a
@@ -302,6 +305,8 @@ class ChannelBank:
                 where matter has losses, C − jG/ω.
             shield_coupling: Charge on each electrode per volt on all shields together [F],
                 shape (..., M); None where the sensor has no shields.
+            connected: Which electrodes are connected to the chip, shape (..., M); all by default.
+                Others are neither read nor driven.
 
         Returns:
             Channel capacitances [F], shape (..., K).
@@ -316,24 +321,36 @@ class ChannelBank:
                 f"capacitance has shape {matrix.shape}; {m} electrodes need (..., {m}, {m})"
             )
         rows = matrix[..., self._sense, :]
-        terms = (rows * self._volts).sum(axis=-1)
+        volts: Array = self._volts
+        if connected is not None:
+            volts = volts * connected[..., None, :] * connected[..., self._sense, None]
+        terms = (rows * volts).sum(axis=-1)
         if shield_coupling is not None:
-            terms = terms + np.asarray(shield_coupling)[..., self._sense] * self._shield
+            shields = np.asarray(shield_coupling)[..., self._sense] * self._shield
+            terms = terms + (
+                shields if connected is None else shields * connected[..., self._sense]
+            )
         terms = self._factor * terms
         out = terms[..., : len(self)]
         for number in range(len(self), len(self._channel)):
             out[..., self._channel[number]] += terms[..., number]
         for part in self._with_free:
-            out[..., part.channel] += self._induced(matrix, shield_coupling, part)
+            out[..., part.channel] += self._induced(matrix, shield_coupling, part, connected)
         if not np.isfinite(out).all():
             raise ReadoutError(
                 "capacitance holds a number that is not finite; correct the readings"
             )
         return out
 
-    def _induced(self, matrix: Array, coupling: Array | None, part: _Measurement) -> Array:
+    def _induced(
+        self, matrix: Array, coupling: Array | None, part: _Measurement,
+        connected: NDArray[np.bool_] | None,
+    ) -> Array:  # fmt: skip
         """What the potentials of free electrodes add to a channel [F]."""
-        charge = (matrix * part.volts).sum(axis=-1)
+        volts_given, factor = part.volts, part.factor
+        if connected is not None:
+            volts_given, factor = volts_given * connected, factor * connected
+        charge = (matrix * volts_given[..., None, :]).sum(axis=-1)
         if coupling is not None:
             charge = charge + np.asarray(coupling) * part.shield
         lift = np.stack([matrix[..., group].sum(axis=-1) for group in part.free], axis=-1)
@@ -347,7 +364,7 @@ class ChannelBank:
                 "correct the readings"
             ) from None
         raised = (lift * volts[..., None, :]).sum(axis=-1)
-        return (raised * part.factor).sum(axis=-1)
+        return (raised * factor).sum(axis=-1)
 
 
 def _measurement(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._validate import as_number
+from capsense._validate import as_number, shorten
 from capsense.errors import ReadoutError
 
 Array = NDArray[np.float64]
@@ -85,9 +85,52 @@ def per_channel(owner: str, name: str, value: object, channels: int) -> Array:
     Raises:
         ReadoutError: The count does not fit, or a number is not finite.
     """
+    return spread(owner, name, value, (channels,))
+
+
+def spread(owner: str, name: str, value: object, shape: tuple[int, ...]) -> Array:
+    """A number for all, or an array of the last axes of ``shape``, as an array of that shape.
+
+    Axes of length 1 stand for any length where there are several.
+
+    Raises:
+        ReadoutError: The count does not fit, or a number is not finite.
+    """
     array = finite(f"{owner}: {name}", value)
-    if array.shape not in ((), (channels,)):
+    last = shape[len(shape) - array.ndim :]
+    fits = array.ndim <= len(shape) and all(
+        given in (wanted, 1 if len(shape) > 1 else wanted)
+        for given, wanted in zip(array.shape, last, strict=True)
+    )
+    if not fits:
+        wanted = f"a list of {shape[-1]}, one per channel"
+        if len(shape) > 1:
+            wanted = f"an array that can be broadcast to {shape}"
+        shown = repr(value) if array.ndim < 2 else f"of shape {array.shape}"
+        raise ReadoutError(f"{owner}: {name} is {shown}; give a number, or {wanted}")
+    return np.broadcast_to(array, shape).copy()
+
+
+def chosen(environments: object, count: int) -> Ints:
+    """Numbers of environments, rising, shape (r,): of numbers, of a mask, or of None for all.
+
+    Raises:
+        ReadoutError: There is no such environment, or the mask is of another length.
+    """
+    if environments is None:
+        return np.arange(count)
+    try:
+        given = np.asarray(environments)
+    except (TypeError, ValueError, RuntimeError):
+        given = np.array(None)
+    if given.dtype == bool and given.shape == (count,):
+        return np.flatnonzero(given)
+    if not given.size:
+        return np.zeros(0, np.int64)
+    whole = given.dtype.kind in "iu"
+    if not whole or (given < 0).any() or (given >= count).any():
         raise ReadoutError(
-            f"{owner}: {name} is {value!r}; give a number, or a list of {channels}, one per channel"
+            f"environments is {shorten(environments)}; give numbers from 0 to {count - 1}, or a "
+            f"mask of {count}"
         )
-    return np.broadcast_to(array, (channels,)).copy()
+    return np.unique(given).astype(np.int64)

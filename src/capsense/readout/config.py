@@ -11,7 +11,7 @@ from typing import Any, Protocol, cast
 from capsense import _validate
 from capsense._validate import read_toml, suggest
 from capsense.errors import ReadoutError
-from capsense.readout.calibration import LinearSensor
+from capsense.readout.calibration import LinearSensor, ResponseCurve
 from capsense.readout.channels import (
     RESTS,
     Pattern,
@@ -30,7 +30,7 @@ from capsense.readout.readout import ReadingLike, Readout, build
 TOP_KEYS = (
     "chip", "rate", "period", "latency", "seed", "random", "expected", "capdac", "mode", "pairs",
     "rest", "channel", "tank", "front_end", "wiring", "noise", "climate", "detector", "calibration",
-    "nonlinearity", "capdac_errors", "specimen",
+    "curve", "nonlinearity", "capdac_errors", "specimen",
 )  # fmt: skip
 
 
@@ -52,19 +52,22 @@ class ReadoutTable(_validate.Table):
             raise self.error(str(error)) from None
 
 
-def load_readout(path: str | Path, electrodes: Sequence[str]) -> Readout:
+def load_readout(path: str | Path, electrodes: Sequence[str], **options: Any) -> Readout:
     """Load a readout file.
 
     Args:
         path: The ``.toml`` file.
         electrodes: Electrode names of the sensor, in matrix order.
+        **options: Those of :class:`~capsense.readout.presets.ReadoutOptions` that go before what
+            the file says; ``stages`` come before those of the file.
 
     Raises:
         ReadoutError: There is no such file, or anything in it is wrong; the message names the
             file, the item, the value and the fix.
     """
     file = Path(path)
-    return parse_readout(read_toml(file, "readout", ReadoutError), electrodes, source=file.name)
+    content = read_toml(file, "readout", ReadoutError)
+    return parse_readout(content, electrodes, source=file.name, **options)
 
 
 def choose_readout(choice: str | Path, electrodes: Sequence[str], empty: ReadingLike) -> Readout:
@@ -129,9 +132,11 @@ def file_content(
 
 
 def parse_readout(
-    data: Mapping[str, Any], electrodes: Sequence[str], *, source: str = "readout"
+    data: Mapping[str, Any], electrodes: Sequence[str], *, source: str = "readout", **changes: Any
 ) -> Readout:
     """Build a readout from the content of its file, given as nested dicts.
+
+    ``changes`` are options of :func:`load_readout`.
 
     Raises:
         ReadoutError: Anything is wrong.
@@ -157,11 +162,16 @@ def parse_readout(
         options["law"] = _law(top, chip)
     for key, read in (
         ("wiring", _wiring), ("noise", _noise), ("climate", _climate), ("detector", _detector),
-        ("calibration", _calibration),
     ):  # fmt: skip
         if key in top:
             table = ReadoutTable(top.data[key], source, key)
             options.update(read(table))
+    options["stages"] = tuple(
+        read_stage(ReadoutTable(top.data[key], source, key))
+        for key, read_stage in (("curve", _curve), ("calibration", _calibration))
+        if key in top
+    )
+    options |= {**changes, "stages": (*changes.get("stages", ()), *options["stages"])}
     with top.named():
         return build(chip, electrodes, ReadoutOptions.of(options))
 
@@ -347,7 +357,7 @@ def _detector(table: ReadoutTable) -> dict[str, Any]:
     return {"detector": Detector(touch, release, tracker, table.integer("debounce", 1, 10**6, 1))}
 
 
-def _calibration(table: ReadoutTable) -> dict[str, Any]:
+def _calibration(table: ReadoutTable) -> LinearSensor:
     """What ``Calibration.toml`` writes: one number for all channels, or one per channel."""
     limits = {"gain": (-1e6, 1e6, ""), "offset": (-1e-6, 1e-6, "F"), "drift": (-1e-6, 1e-6, "F/s")}
     table.only((*limits, "epoch"))
@@ -355,4 +365,13 @@ def _calibration(table: ReadoutTable) -> dict[str, Any]:
     figures: dict[str, Any] = {"gain": 1.0, "offset": 0.0, "drift": 0.0, **given}
     epoch = table.number("epoch", -1e12, 1e12, 0.0)
     with table.named():
-        return {"stages": (LinearSensor(**figures, epoch=epoch),)}
+        return LinearSensor(**figures, epoch=epoch)
+
+
+def _curve(table: ReadoutTable) -> ResponseCurve:
+    """What ``ResponseCurve.toml`` writes: points for all channels, or a list of them for each."""
+    table.only(("true", "measured"))
+    what = "a list of capacitances in F, or one list per channel"
+    points = {key: table.raw(key, what) for key in ("true", "measured")}
+    with table.named():
+        return ResponseCurve(**points)

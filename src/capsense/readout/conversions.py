@@ -315,14 +315,3 @@ def join(parts: Sequence[Counts]) -> Counts:
         return None if columns[0] is None else np.concatenate(columns)
 
     return Counts(parts[0].channel_names, *(column(n) for n in COLUMNS))  # type: ignore[arg-type]
-
-
-class _Columns:
-    """Stands for the channels of all chips: there is nothing to pick from a matrix any more."""
-
-    def __init__(self, differences: NDArray[np.bool_], count: int) -> None:
-        self.differences = np.tile(differences, count)
-        self.names = tuple(map(str, range(len(self.differences))))
-
-    def __len__(self) -> int:
-        return len(self.names)

@@ -120,7 +120,10 @@ class CapDac:
         """
         code = np.arange(self.codes)
         on = (code >> np.arange(self.bits)[:, None]) & 1
-        return np.asarray(code * self.step + errors @ on, dtype=float)
+        wrong = np.zeros((len(errors), self.codes))
+        for bit in range(self.bits):  # a product of matrices would round rows by their number
+            wrong += errors[:, [bit]] * on[bit]
+        return np.asarray(code * self.step + wrong, dtype=float)
 
     def nearest(self, capacitance: Array) -> Ints:
         """Code nominally nearest to capacitances [F]."""
@@ -153,10 +156,17 @@ class Conversion:
             if errors is None:
                 errors = np.zeros((channels, dac.bits))
                 errors[:, : len(dac.bit_errors)] = dac.bit_errors
-            self._actual = dac.actual(errors)
+            self._actual = np.empty((channels, dac.codes))
             self._with = np.ones(channels, bool) if without is None else ~without
-            start = -1 if dac.start == "auto" else dac.start
-            self.dac_codes = np.where(self._with, start, 0)
+            self.dac_codes = np.zeros(channels, np.int64)
+            self.restart(np.arange(channels), errors)
+
+    def restart(self, channel: Ints, errors: Array) -> None:
+        """Set the DACs of some channels as at the start, with errors [F], shape (n, bits)."""
+        if self._dac is not None:
+            start = -1 if self._dac.start == "auto" else self._dac.start
+            self._actual[channel] = self._dac.actual(errors)
+            self.dac_codes[channel] = np.where(self._with[channel], start, 0)
 
     def __call__(self, channel: Ints, value: Array) -> tuple[Ints, Array, Flags]:
         """Convert a batch.

@@ -30,7 +30,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadoutError
-from capsense.readout.checks import Array, Ints, finite, require, require_whole
+from capsense.readout.checks import Array, Ints, finite, require, require_whole, spread
 
 _POLES_PER_DECADE = 2.0
 
@@ -47,10 +47,35 @@ class Context:
     """Time from one sample of a channel to its next [s]."""
     rng: np.random.Generator
     """Random numbers of this stage alone."""
+    chips: tuple[int, ...] = ()
+    """How many environments, and sensors in each, have a chip; the channels are those of all, chip
+    after chip. Empty for a single chip."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The channels, chip by chip: (K,), or (environments, sensors, K)."""
+        return (*self.chips, self.channels // math.prod(self.chips))
+
+    def figures(self, owner: str, name: str, value: object) -> Array:
+        """A stage's figures, one a channel, shape (channels,).
+
+        Args:
+            owner: Of which stage, for messages.
+            name: What they are.
+            value: A number for all, one a channel, or more axes in front: one a channel and chip.
+
+        Raises:
+            ReadoutError: The count does not fit, or a number is not finite.
+        """
+        return spread(owner, name, value, self.shape).reshape(-1)
 
 
 class Process(Protocol):
     """A stage at work.
+
+    One that knows chips side by side, as all of this package do, has a method
+    ``restart(channel)`` too, if it holds anything that changes: it begins anew for some channels.
+    Those of a user's own work chip by chip.
 
     A copy of a readout copies its processes: keep what changes in objects that can be copied, as
     the arguments of a ``functools.partial``, and not in the variables of an enclosing function.
@@ -130,8 +155,7 @@ class Flicker:
         rng = context.rng
         keep = np.exp(-context.period / taus)
         kick = np.sqrt(variance * -np.expm1(-2 * context.period / taus))
-        state = math.sqrt(variance) * rng.standard_normal((context.channels, len(taus)))
-        return partial(_add_flicker, rng, keep, kick, state)
+        return Poles(rng, context.channels, keep, kick, math.sqrt(variance))
 
 
 @dataclass(frozen=True)
@@ -146,27 +170,43 @@ class RandomWalk:
 
     def start(self, context: Context) -> Process:
         """Return the process."""
-        step = self.rate * math.sqrt(context.period)
-        return partial(_add_walk, context.rng, step, np.zeros(context.channels))
+        step = np.array([self.rate * math.sqrt(context.period)])
+        return Poles(context.rng, context.channels, np.ones(1), step, 0.0)
 
 
-def _add_flicker(
-    rng: Generator, keep: Array, kick: Array, state: Array, channel: Ints, time: Array, value: Array
-) -> Array:
-    states = kick * rng.standard_normal((len(value), len(kick)))
-    _recur(states, keep, state, channel)
-    return value + states.sum(axis=1)
+class Poles:
+    """First-order processes at work, the same for each channel; their sum is added.
+
+    Args:
+        rng: Random numbers.
+        channels: Number of channels.
+        keep: What each process keeps of its state from sample to sample, shape (p,).
+        kick: Standard deviation of what is added to it [F], shape (p,).
+        spread: Standard deviation of the states at the start [F].
+    """
+
+    def __init__(
+        self, rng: Generator, channels: int, keep: Array, kick: Array, spread: float
+    ) -> None:
+        self.keep, self.kick, self.spread, self._rng = keep, kick, spread, rng
+        self._state = np.zeros((channels, len(keep)))
+        self.restart(np.arange(channels))
+
+    def restart(self, channel: Ints) -> None:
+        """Draw the states of some channels anew."""
+        self._state[channel] = 0.0
+        if self.spread:
+            drawn = self._rng.standard_normal((len(channel), len(self.keep)))
+            self._state[channel] = self.spread * drawn
+
+    def __call__(self, channel: Ints, time: Array, value: Array) -> Array:
+        """See :class:`Process`."""
+        states = self.kick * self._rng.standard_normal((len(value), len(self.kick)))
+        _recur(states, self.keep, self._state, channel)
+        return value + states.sum(axis=1)
 
 
-def _add_walk(
-    rng: Generator, step: float, state: Array, channel: Ints, time: Array, value: Array
-) -> Array:
-    walked = step * rng.standard_normal(len(value))
-    _recur(walked, 1.0, state, channel)
-    return value + walked
-
-
-def _recur(kicks: Array, keep: Array | float, state: Array, channel: Ints) -> None:
+def _recur(kicks: Array, keep: Array, state: Array, channel: Ints) -> None:
     """Add ``keep`` times its channel's last state to each kick, in place.
 
     As any K samples in a row are of different channels, a channel's last state lies K rows back;
@@ -204,12 +244,31 @@ class Mains:
 
     def start(self, context: Context) -> Process:
         """Return the process."""
-        phase = 2 * math.pi * context.rng.random()
-        passed = self.amplitude * float(np.sinc(self.frequency * context.conversion)) ** self.order
-        return partial(self._add, passed, phase)
+        return PickUp(self, context)
 
-    def _add(self, passed: float, phase: float, channel: Ints, time: Array, value: Array) -> Array:
-        return value + passed * np.sin(2 * math.pi * self.frequency * time + phase)
+    def passed(self, conversion: float) -> float:
+        """Amplitude after an average over a conversion of that length [s], in farads."""
+        return self.amplitude * float(np.sinc(self.frequency * conversion)) ** self.order
+
+
+class PickUp:
+    """Pick-up from the mains at work, of a phase for each chip."""
+
+    def __init__(self, mains: Mains, context: Context) -> None:
+        self._passed, self._omega = mains.passed(context.conversion), 2 * math.pi * mains.frequency
+        self._channels, self._rng = context.shape[-1], context.rng
+        self._phase = np.zeros(context.channels // self._channels)
+        self.restart(np.arange(context.channels))
+
+    def restart(self, channel: Ints) -> None:
+        """Draw the phases of some channels' chips anew."""
+        chips = np.unique(channel // self._channels)
+        self._phase[chips] = 2 * math.pi * self._rng.random(len(chips))
+
+    def __call__(self, channel: Ints, time: Array, value: Array) -> Array:
+        """See :class:`Process`."""
+        phase = self._phase[channel // self._channels]
+        return value + self._passed * np.sin(self._omega * time + phase)
 
 
 @dataclass(frozen=True)

@@ -241,7 +241,12 @@ def chip_of(name: str) -> Chip:
     Raises:
         ReadoutError: There is no such chip.
     """
-    key = name.strip().lower() if isinstance(name, str) else ""
+    key = str(name).strip().lower() if isinstance(name, str | Path) else ""
+    if key.endswith(".toml"):
+        raise ReadoutError(
+            f"{str(name)!r} is a readout file; load_readout({str(name)!r}, electrodes, …) takes "
+            "it, with the same options"
+        )
     if key not in CHIPS:
         raise ReadoutError(f"unknown chip {name!r}; {suggest(str(name), CHIPS)}")
     return CHIPS[key]

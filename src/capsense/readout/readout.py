@@ -22,7 +22,7 @@ from capsense.readout.presets import Chip, ReadoutOptions, chip_of, parts_of
 
 _BATCH = 4096
 """Samples processed at a time."""
-_AT_ONCE = 20_000_000
+AT_ONCE = 20_000_000
 """Samples that a single step may hold: hours of the fastest chip."""
 SEED_STRIDE = 2**32
 """How far apart the seeds of sensors side by side lie: where seeds count up from run to run, no
@@ -80,7 +80,6 @@ class Readout:
                 f"bank is {bank!r}; give the channels, ChannelBank(patterns, electrodes)"
             )
         self.bank = bank
-        self._sensors = 1  # many chips side by side have more
         self.name = "readout"
         """For titles."""
         for kind, parts in ((Wiring, [wiring]), (Detector, [detector]), (Stage, stages)):
@@ -164,12 +163,8 @@ class Readout:
         if self.dac is None:
             return Conversion(self.law, None, channels)
         without = np.zeros(channels, bool) if self.dac.differential else differences
-        return Conversion(self.law, self.dac, channels, self._errors(channels), without)
-
-    def _errors(self, channels: int) -> Array:
-        """Errors of the offset DACs' bits [F], shape (channels, bits)."""
-        assert self.dac is not None
-        return self.dac.specimens(channels // self._sensors, self._seed, self._sensors)
+        errors = self.dac.specimens(channels, self._seed)
+        return Conversion(self.law, self.dac, channels, errors, without)
 
     def due(self, until: float) -> Array:
         """Instants at which capacitances are wanted next [s], up to ``until`` [s], rising."""
@@ -328,9 +323,9 @@ class Readout:
     def _require_patience(self, now: float) -> None:
         """Refuse a leap over more conversions than anybody wants at once."""
         plan = self.schedule
-        if (now / plan.period) * plan.count - self._seen > _AT_ONCE:
+        if (now / plan.period) * plan.count - self._seen > AT_ONCE:
             raise ReadoutError(
-                f"{now + self._start:g} s is more than {_AT_ONCE:.0e} conversions after the last "
+                f"{now + self._start:g} s is more than {AT_ONCE:.0e} conversions after the last "
                 "time; take smaller steps, or begin there: reset(start=…)"
             )
 

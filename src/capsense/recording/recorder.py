@@ -6,21 +6,18 @@ import atexit
 import errno
 import logging
 import math
-import types
-import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from importlib import import_module
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from capsense._thread_pool import ForkSafeRLock
 from capsense.adapters import AttachedSensor
 from capsense.codec import design_to_json
-from capsense.errors import ReadoutError, RecordingError, require_package
+from capsense.errors import ReadoutError, RecordingError
 from capsense.reading import Reading
 from capsense.readout import Readout
 from capsense.recording import DESIGN, NAME, SESSION, check_name, describe, make_readout, ros
+from capsense.recording.dds import LiveTopics
 from capsense.recording.files import McapFile
 from capsense.scenario.model import Scenario
 from capsense.scene import DepthFrame, Scene
@@ -287,114 +284,3 @@ def _stepped_elsewhere(count: int) -> RecordingError:
         f"the simulator took a step after number {count} that was not recorded, so a replay could "
         "not repeat what follows; step it through the recorder only, or reset it first"
     )
-
-
-_BLOCK_MS = 1
-"""How long a writer waits for a reader that does not keep up [ms]."""
-
-
-class LiveTopics:
-    """Experimental: publishes messages of standard types over DDS, without a ROS installation.
-
-    Others, and those that a slow reader misses, are dropped. Topics, types and the CDR form follow
-    the conventions of ROS 2 (``rt/…``, ``…::msg::dds_::…_``).
-
-    If publishing fails, it warns and stops; the recording goes on.
-
-    Args:
-        domain: The ROS domain, ``ROS_DOMAIN_ID``.
-
-    Raises:
-        MissingDependencyError: CycloneDDS is not installed.
-    """
-
-    def __init__(self, domain: int) -> None:
-        require_package("cyclonedds.domain", "CycloneDDS, which publishing needs,", "live")
-        from cyclonedds.domain import DomainParticipant
-
-        self._participant = DomainParticipant(domain)
-        self._failed = False
-        self._types: dict[str, Any] = {}
-        self._writers: dict[str, Any] = {}
-
-    def write(self, stamp: int, messages: Sequence[tuple[str, Any]]) -> None:
-        """Publish messages of one stamp [ns], each with its topic, and the clock.
-
-        Warns:
-            UserWarning: Publishing has failed, and stops.
-        """
-        from cyclonedds.core import DDSException
-
-        if self._failed:
-            return
-        clock = ros.make("rosgraph_msgs/msg/Clock", clock=divmod(stamp, _SECOND))
-        try:
-            for topic, message in (("/clock", clock), *messages):
-                if not message.__msgtype__.startswith(ros.PACKAGE):
-                    self._publish(topic, message)
-        except DDSException as error:
-            self._failed = True
-            warnings.warn(f"publishing to ROS has stopped: {error}", stacklevel=4)
-
-    def _publish(self, topic: str, message: Any) -> None:
-        from cyclonedds.core import DDSException
-
-        name = message.__msgtype__
-        writer = self._writers.get(topic)
-        if writer is None:
-            writer = self._writers[topic] = self._writer(topic, name)
-        sample = object.__new__(self._types[name])
-        sample.encoded = ros.encode(message)
-        try:
-            writer.write(sample)
-        except DDSException as error:
-            if error.code != DDSException.DDS_RETCODE_TIMEOUT:
-                raise
-
-    def _writer(self, topic: str, type_name: str) -> Any:
-        from cyclonedds.core import Policy, Qos
-        from cyclonedds.pub import DataWriter
-        from cyclonedds.topic import Topic
-        from cyclonedds.util import duration
-
-        kept = ros.lasting(topic)
-        durability = Policy.Durability.TransientLocal if kept else Policy.Durability.Volatile
-        qos = Qos(
-            Policy.Reliability.Reliable(duration(milliseconds=_BLOCK_MS)),
-            Policy.History.KeepLast(kept or 10),
-            durability,
-        )
-        described = Topic(self._participant, f"rt{topic}", self._type(type_name), qos=qos)
-        return DataWriter(self._participant, described, qos=qos)
-
-    def _type(self, name: str) -> Any:
-        """The class that tells CycloneDDS of a ROS type; its samples are encoded beforehand."""
-        from cyclonedds.idl import IdlStruct
-
-        if name not in self._types:
-            package, _, short = name.partition("/msg/")
-            fields = {field: self._field(kind) for field, kind in ros.fields_of(name)}
-
-            def fill(namespace: dict[str, Any]) -> None:
-                namespace["__annotations__"] = fields
-                namespace["serialize"] = lambda sample, **_: sample.encoded
-
-            mangled = {"typename": f"{package}::msg::dds_::{short}_"}
-            self._types[name] = dataclass(types.new_class(short, (IdlStruct,), mangled, fill))
-        return self._types[name]
-
-    def _field(self, kind: tuple[Any, Any]) -> Any:
-        """The IDL type of a field of a ROS type."""
-        from rosbags.interfaces import Nodetype
-
-        idl: Any = import_module("cyclonedds.idl.types")
-        node, what = kind
-        if node == Nodetype.NAME:
-            return self._type(what)
-        if node == Nodetype.BASE:
-            base = what[0]
-            return {"string": str, "bool": bool}.get(base) or getattr(idl, base)
-        inner, size = what
-        if node == Nodetype.ARRAY:
-            return idl.array[self._field(inner), size]
-        return idl.sequence[self._field(inner)]

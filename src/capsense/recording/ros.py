@@ -44,7 +44,7 @@ Topics = list[tuple[str, Any]]
 PACKAGE = "capsense_msgs/msg"
 OWN = ("Shape", "Body", "Step", "Counts", "Touch", "Signal", "Signals")
 """Messages of ``capsense_msgs``."""
-_LASTING = {"markers": 1, "electrodes": 1, "shapes": 1000, "bodies": 1000}
+_LASTING = {"about": 1, "markers": 1, "electrodes": 1, "shapes": 1000, "bodies": 1000}
 WORLD = "world"
 """Frame in which the sensor moves."""
 METAL: Colour = (0.72, 0.74, 0.78, 1.0)

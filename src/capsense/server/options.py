@@ -6,10 +6,14 @@ import hmac
 import ipaddress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from capsense.errors import ServerError
 from capsense.server.binary import HEADER
 from capsense.server.messages import MAX_TEXT
+
+if TYPE_CHECKING:
+    from capsense.readout import Readout
 
 
 @dataclass(frozen=True)
@@ -56,8 +60,9 @@ class ServerOptions:
 
     designs: tuple[str | Path, ...]
     """Packaged names or design files; the first is the default."""
-    readout: str | Path | None = None
-    """A chip's name, or a readout file; none: capacitances only."""
+    readout: Readout | str | Path | None = None
+    """A chip's name, a readout file, or a readout, of which every sensor has a copy; none:
+    capacitances only."""
     host: str = "127.0.0.1"
     port: int = 8765
     """0 for any free one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import json
 import logging
 import time
@@ -20,7 +21,7 @@ from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import ProtocolError, ServerError
 from capsense.readout import SEED_STRIDE, Readout
-from capsense.readout.config import choose_readout, file_content, parse_readout
+from capsense.readout.config import file_content, make_readout, parse_readout
 from capsense.scene import Body, Pose, Scene, Sphere
 from capsense.scene.depth import DepthFrame
 from capsense.server.binary import PROTOCOL
@@ -257,9 +258,10 @@ class Server:
             if design.name in designs:
                 raise ServerError(f"two designs are named {design.name!r}")
             designs[design.name] = design
-            if self.options.readout is not None:
-                content = file_content(self.options.readout, design.electrode_names)
-                parse_readout(content, design.electrode_names, source=str(self.options.readout))
+            choice = self.options.readout
+            if choice is not None and not isinstance(choice, Readout):
+                content = file_content(choice, design.electrode_names)
+                parse_readout(content, design.electrode_names, source=str(choice))
         return list(designs.values())
 
     def _make_readout(self, simulator: Simulator, number: int) -> Readout | None:
@@ -267,7 +269,7 @@ class Server:
         choice = self.options.readout
         if choice is None:
             return None
-        readout = choose_readout(choice, simulator.electrode_names, simulator.empty)
+        readout = copy.deepcopy(make_readout(choice, simulator))
         readout.reset(seed=readout.seed + number * SEED_STRIDE)
         return readout
 

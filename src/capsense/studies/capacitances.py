@@ -361,8 +361,14 @@ def load_readout_template(choice: str | Path) -> Template | str:
     """The file of a readout by its path, or the name of a chip as it is.
 
     Raises:
-        ReadoutError: There is no such file, or it is not TOML.
+        ReadoutError: There is no such file, or it is not TOML; or it is a readout, of which no
+            number can be varied.
     """
+    if not isinstance(choice, str | Path):
+        raise ReadoutError(
+            f"readout is {choice!r}; a study varies the numbers of files: give a chip's name, or "
+            "the path of a readout file"
+        )
     if str(choice).endswith(".toml"):
         return Template.load(choice, "readout", ReadoutError)
     return str(choice)

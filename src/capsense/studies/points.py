@@ -7,7 +7,7 @@ import io
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from queue import Empty
 from typing import Any, Protocol
 
 from capsense._thread_pool import processors
+from capsense._workers import process_pool
 from capsense.errors import (
     CapSenseError,
     DesignError,
@@ -325,10 +326,7 @@ def _evaluated(
         return
     context = get_context("spawn")
     queue, stop = context.Queue(), context.Event()
-    pool = ProcessPoolExecutor(
-        min(jobs, len(tasks)), mp_context=context, initializer=_begin, initargs=(queue, stop)
-    )
-    with pool:
+    with process_pool(min(jobs, len(tasks)), _begin, queue, stop) as pool:
         futures: list[Future[None]] = [pool.submit(_carry_out, evaluation, t) for t in tasks]
         left = len(todo)
         try:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest, norm, qmc, triang
+from scipy.stats import binomtest, qmc
 
 from capsense._validate import read_toml, suggest
 from capsense.errors import CapSenseError, DesignError, ReadoutError, ScenarioError
+from capsense.readout.randomisation import Distribution
 from capsense.scenario import ScenarioTable as Table
 from capsense.studies.capacitances import (
     Capacitances,
@@ -41,37 +42,6 @@ KINDS = {
 """Distributions, and the keys of each."""
 POOR_FIT = 0.9
 """Where a linear fit explains less of the variance, a warning is given."""
-
-
-class Distribution(NamedTuple):
-    """How a parameter scatters."""
-
-    kind: Literal["normal", "uniform", "triangular"]
-    first: float
-    """Mean of a normal distribution, lower end of others."""
-    second: float
-    """Standard deviation of a normal distribution, upper end of others."""
-    peak: float = 0.0
-    """The most likely value of a triangular distribution."""
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation."""
-        if self.kind == "normal":
-            return self.second
-        width = self.second - self.first
-        if self.kind == "uniform":
-            return float(width / np.sqrt(12.0))
-        return float(triang.std((self.peak - self.first) / width, scale=width))
-
-    def values(self, shares: Array) -> Array:
-        """Quantiles of shares in (0, 1)."""
-        width = self.second - self.first
-        if self.kind == "normal":
-            return np.asarray(norm.ppf(shares, self.first, self.second))
-        if self.kind == "uniform":
-            return self.first + width * shares
-        return np.asarray(triang.ppf(shares, (self.peak - self.first) / width, self.first, width))
 
 
 class Specification(NamedTuple):

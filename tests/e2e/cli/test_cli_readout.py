@@ -166,6 +166,10 @@ def test_a_file_of_options(run, tmp_path):
     rows = table(folder / "counts_mine.csv")
     assert {"baseline", "touched"} <= rows[0].keys()
     assert {r["touched"] for r in rows} == {"0", "1"}
+    other = tmp_path / "other"
+    assert main(["readout", str(folder), "--chip", str(config), "-o", str(other)]) == OK
+    assert table(other / "counts_mine.csv") == rows
+    assert main(["readout", str(folder), "--chip", str(config), "--rate", "400"]) == BAD_INPUT
 
 
 def test_tables_are_not_replaced_by_accident(run, capsys):

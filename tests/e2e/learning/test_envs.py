@@ -37,7 +37,7 @@ from capsense.learning.envs.signals import (  # noqa: E402
 scripted = SimpleNamespace(
     **runpy.run_path(str(Path(__file__).parents[3] / "examples" / "policies.py"))
 )
-FOLLOW, DRESS, STOP = IDS
+FOLLOW, DRESS, STOP, _ = IDS
 TIP = cs.Pose((0.0, 0.0, 0.03))
 """A sensor on the fingertip of Gymnasium's Reacher, looking up."""
 
@@ -157,6 +157,28 @@ def test_latency_and_noise_are_as_set() -> None:
     truth = np.diag(env.skin.read()["pad"].delta) * 1e14
     tare = 1e14 * env.signals.tare["pad"] - 1e14 * np.diag(env.simulator.baseline)
     assert observation[:6] == approx(truth - tare, abs=0.15)
+
+
+def test_files_and_readouts_in_place_of_a_chip(tmp_path: Path) -> None:
+    """They keep their rate, noise and calibration; gain, drift and latency come on top."""
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'chip = "fdc1004"\nrate = 200\nlatency = 0.001\n[calibration]\ngain = 1.25\n', "utf-8"
+    )
+    names = cs.Simulator("six_patch").electrode_names
+    middle = dataclasses.replace(Randomisation().held(), latency=(0.02, 0.02))
+    for chip in (str(path), path, cs.load_readout(path, names)):
+        env = gymnasium.make(FOLLOW, randomisation=middle, chip=chip).unwrapped
+        env.reset(seed=0)
+        found = env.signals.readouts["pad"]
+        assert found.schedule.latency == approx(0.021, rel=1e-12)
+        assert found.schedule.conversion == approx(5e-3, rel=1e-12)
+        assert [type(stage).__name__ for stage in found.stages] == [
+            "LinearSensor", "LinearSensor", "Flicker", "White", "RandomWalk"
+        ]  # fmt: skip
+        assert found.stages[1].gain == 1.25
+    with pytest.raises(cs.ReadoutError, match="there is no readout file"):
+        gymnasium.make(FOLLOW, chip="none.toml")
 
 
 def test_ranges_by_name() -> None:

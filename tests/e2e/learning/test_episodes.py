@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -16,6 +17,7 @@ import capsense as cs
 from capsense.__main__ import main
 from capsense.learning.episodes import Episodes, load_episodes
 from capsense.learning.shards import missing, run
+from capsense.readout.calibration import LinearSensor
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -124,8 +126,22 @@ def test_frames_are_those_of_the_environment(made: Path) -> None:
     mine = table.filter(pa.compute.equal(table["episode_index"], 3))
     env = spec.make()
     rng = np.random.default_rng(np.random.SeedSequence((5, 3)))
-    observation, _ = env.reset(seed=int(rng.integers(2**31)))
+    seed = int(rng.integers(2**31))
+    observation, _ = env.reset(seed=seed)
+    drawn = env.unwrapped.drawn
+    expected = {f.name: getattr(drawn, f.name) for f in dataclasses.fields(drawn)}
+    assert len(expected) == 11
+    (gain,) = {
+        float(stage.gain)
+        for chip in env.unwrapped.signals.readouts.values()
+        for stage in chip.stages
+        if isinstance(stage, LinearSensor)
+    }
     for row in mine.to_pylist():
+        assert row["drawn.seed"] == seed
+        for name, value in expected.items():
+            assert row[f"drawn.{name}"] == approx(value, rel=1e-6)
+        assert row["drawn.chip_gain"] == [approx(gain, rel=1e-6)] * 6
         np.testing.assert_array_equal(row["observation.state"], observation)
         observation, reward, over, cut, facts = env.step(np.array(row["action"], np.float32))
         assert row["next.reward"] == approx(reward, rel=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 
 import numpy as np
@@ -117,11 +118,13 @@ def test_several_sensors_and_clients(served: RunningServer, dome: np.ndarray) ->
     assert results == [True] * 30
 
 
-def test_readout(dome: np.ndarray) -> None:
+@pytest.mark.parametrize("given", ["name", "object"])
+def test_readout(dome: np.ndarray, given: str) -> None:
     """Counts are those of the chip, between readings, from the first frame's time on."""
     simulator = Simulator("six_patch")
     readout = cs.Readout.preset("fdc1004", simulator.electrode_names)
-    with RunningServer(readout="fdc1004") as server, server.client() as client:
+    choice = "fdc1004" if given == "name" else copy.deepcopy(readout)
+    with RunningServer(readout=choice) as server, server.client() as client:
         sensor, other = client.open(), client.open()
         assert sensor.channel_names == readout.channel_names
         times = 100.0 + 0.01 * np.arange(30)

@@ -107,10 +107,11 @@ def test_a_seed_repeats():
     matrix = matrices(np.random.default_rng(4))
     many = SideBySide(Readout.preset("fdc1004", NAMES), COUNT, seed=7)
     first = [many.sample(0.01 * k, matrix).code for k in range(20)]
-    many.reset()
+    many.reset(seed=7)
     np.testing.assert_array_equal(first, [many.sample(0.01 * k, matrix).code for k in range(20)])
-    many.reset(seed=8)
-    assert (first[-1] != [many.sample(0.01 * k, matrix).code for k in range(20)][-1]).any()
+    for seed in (8, None):
+        many.reset(seed=seed)
+        assert (first[-1] != [many.sample(0.01 * k, matrix).code for k in range(20)][-1]).any()
 
 
 def test_a_fleet_reads_through_chips():
@@ -150,7 +151,7 @@ def on_warp(readout, count=COUNT, seed=0, empty=None):
     from capsense.fleet.warp_chips import WarpChips
 
     empty = np.zeros((6, 6)) if empty is None else empty
-    chips = WarpChips(readout, (count, 1), empty, seed, wp.get_device("cpu"))
+    chips = WarpChips(readout, count, 1, empty, wp.get_device("cpu"), seed=seed)
     shields = wp.zeros((count, 1, 6), dtype=wp.float64, device="cpu")
 
     def sample(time, matrix):
@@ -249,17 +250,13 @@ def test_refused_on_warp():
         on_warp(Readout(whole.bank, whole.schedule, whole.law, stages=[Own()]))
     with pytest.raises(ReadoutError, match="leaves electrodes open"):
         on_warp(Readout.preset("fdc1004", NAMES, patterns=self_patterns(NAMES, rest="floating")))
-    for pattern, words in (
-        (Pattern("E1", low=("E2",)), "channel 'E1 to E2' .*its transmitter floats"),
-        (Pattern("E1", minus="E2"), "channel 'E1 minus E2' reads several electrodes"),
-        (Pattern(("E1", "E2")), r"channel 'E1\+E2' reads several electrodes"),
-    ):
-        with pytest.raises(ReadoutError, match=words):
-            on_warp(Readout.preset("fdc1004", NAMES, patterns=[pattern]))
+    pattern = Pattern("E1", low=("E2",))
+    with pytest.raises(ReadoutError, match=r"channel 'E1 to E2' .*its transmitter floats"):
+        on_warp(Readout.preset("fdc1004", NAMES, patterns=[pattern]))
 
 
 def test_chips_are_switched_on_anew():
-    """Invariant: a reset repeats the noise, or draws other; the readout given stays as it is."""
+    """Invariant: a reset draws other noise, or repeats it; the readout given stays as it is."""
     fleet, given = Fleet("six_patch", BODIES[:1], 2), Readout.preset("teensy", NAMES, seed=4)
     where = poses(np.random.default_rng(8), 2, 1)
 
@@ -269,8 +266,10 @@ def test_chips_are_switched_on_anew():
     fleet.use_readout(given)
     first = codes()
     fleet.reset()
+    assert codes() != first
+    fleet.reset(seed=4)
     assert codes() == first
-    fleet.reset(start=5.0)
+    fleet.reset(start=5.0, seed=4)
     assert codes(5.0) == first
     fleet.reset(seed=9)
     assert codes() != first

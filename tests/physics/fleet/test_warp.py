@@ -18,6 +18,7 @@ from reference_scenes import diagonal_errors, fleet_of, reference_scenes
 import capsense as cs
 from capsense.errors import SceneError
 from capsense.fleet import Fleet
+from capsense.readout.randomisation import Distribution, ReadoutRandomisation
 
 wp = pytest.importorskip("warp")
 PRIMITIVES = cs.Box, cs.Sphere, cs.Capsule, cs.Cylinder, cs.Ellipsoid
@@ -244,21 +245,23 @@ def test_captured_steps():
     rng = np.random.default_rng(16)
     where = wp.array(poses(rng, 3, 3), dtype=wp.float32, device="cpu")
     frame = wp.array(frames(rng, 3, 2), dtype=wp.float32, device="cpu")
-    time = wp.zeros(1, dtype=wp.float64, device="cpu")
+    time = wp.zeros(3, dtype=wp.float64, device="cpu")
+    scatter = ReadoutRandomisation(gain=Distribution("normal", 1.0, 0.1), jitter=0.01)
     fleet, other = (
         Fleet("six_patch", BODIES, 3, sensors=2, device="warp:cpu", budget=32) for _ in range(2)
     )
     for each in (fleet, other):
-        each.use_readout("fdc1004", seed=3)
+        each.use_readout("fdc1004", seed=3, randomisation=scatter)
         each.step(where, frame, time=0.0, jacobian=True)
     with wp.ScopedCapture("cpu") as capture:
         found = fleet.step(where, frame, time=time, jacobian=True)
     for k in (1, 2):
         where.assign(poses(rng, 3, 3).astype(np.float32))
         frame.assign(frames(rng, 3, 2).astype(np.float32))
-        time.fill_(0.1 * k)
+        clocks = 0.1 * k + np.array([0.0, 0.05, 0.1])
+        time.assign(clocks)
         wp.capture_launch(capture.graph)
-        truth = other.step(where, frame, time=0.1 * k, jacobian=True)
+        truth = other.step(where, frame, time=clocks, jacobian=True)
         assert truth.delta.numpy().any()
         for name in ("capacitance", "delta", "error", "conductance", "shield_coupling", "jacobian"):
             np.testing.assert_array_equal(getattr(found, name), getattr(truth, name))
@@ -266,6 +269,7 @@ def test_captured_steps():
             np.testing.assert_array_equal(getattr(found.held, name), getattr(truth.held, name))
         for each in (fleet, other):
             each.change(0, BODIES[1], [1])
+            each.reset([2], start=0.1)
 
 
 @pytest.mark.parametrize("lossy", [False, True])

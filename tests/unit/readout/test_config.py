@@ -12,7 +12,7 @@ from approximate import approx
 
 from capsense.errors import ReadoutError
 from capsense.readout import Readout
-from capsense.readout.calibration import LinearSensor, calibrate
+from capsense.readout.calibration import LinearSensor, ResponseCurve, calibrate
 from capsense.readout.channels import Pattern, differential_patterns, two_terminal_patterns
 from capsense.readout.checks import phasors, require
 from capsense.readout.config import choose_readout, load_readout, parse_readout
@@ -405,6 +405,40 @@ def test_choosing_by_name_or_file(tmp_path):
     assert choose_readout(path, NAMES, empty).schedule.conversion == approx(2.5e-3, rel=1e-12)
     with pytest.raises(ReadoutError, match="unknown chip 'mpr122'; did you mean 'mpr121'"):
         choose_readout("mpr122", NAMES, empty)
+
+
+def test_a_file_with_options(tmp_path):
+    """Options go before what the file says; its curve and its calibration stay, in that order."""
+    path = tmp_path / "mine.toml"
+    curve = ResponseCurve(np.array([0.0, 1e-12, 2e-12]), 1e-12 * np.arange(9.0).reshape(3, 3))
+    fit = LinearSensor(np.array([1.0, 2.0, 3.0]), np.zeros(3), np.zeros(3), 0.0)
+    head = 'chip = "fdc1004"\nrate = 200\nrandom = false\n'
+    path.write_text(head + fit.toml() + curve.toml(), encoding="utf-8")
+    gain = LinearSensor(np.array(1.1), np.array(0.0), np.array(0.0), 0.0)
+    readout = load_readout(path, NAMES, rate=400, stages=[gain])
+    assert readout.schedule.conversion == approx(2.5e-3, rel=1e-12)
+    first, second, third = readout.stages
+    assert first is gain
+    np.testing.assert_array_equal(second.measured, curve.measured)
+    np.testing.assert_array_equal(second.true, curve.true)
+    np.testing.assert_array_equal(third.gain, fit.gain)
+    assert load_readout(str(path), NAMES).schedule.conversion == approx(5e-3, rel=1e-12)
+    with pytest.raises(ReadoutError, match="no option 'speed'"):
+        load_readout(str(path), NAMES, speed=3)
+    with pytest.raises(
+        ReadoutError, match=r"load_readout\('.*mine.toml', electrodes, …\) takes it"
+    ):
+        Readout.preset(str(path), NAMES)
+    for content, words in (
+        ("[curve]\ntrue = [0.0, 1e-12]\n", r"mine.toml.*curve.*missing key 'measured'"),
+        ('[curve]\ntrue = ["a", "b"]\nmeasured = [0.0, 1.0]\n', "mine.toml.*no real numbers"),
+        ("[curve]\ntrue = [[0.0, 1e-12], [0.0]]\nmeasured = [0.0, 1.0]\n", "rows differ"),
+        ("[curve]\ntrue = [1e-12, 0.0]\nmeasured = [0.0, 1.0]\n", "true values do not rise"),
+        ("[curve]\ntrue = [[0.0, 1.0], [0.0, 1.0]]\nmeasured = [0.0, 1.0]\n", "a list of 3"),
+    ):
+        path.write_text(head + content, encoding="utf-8")
+        with pytest.raises(ReadoutError, match=words):
+            load_readout(path, NAMES)
 
 
 def test_missing_files_are_refused(tmp_path):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -22,10 +24,14 @@ from capsense.adapters import mujoco as adapter
 from capsense.adapters.rules import AttachOptions
 from capsense.errors import SceneError
 from capsense.humans import Build, Limb, arm
-from capsense.learning.envs.signals import LIMIT, Signals
+from capsense.learning.envs.picture import Camera, draw_world
+from capsense.learning.envs.scale import LIMIT, compressed
+from capsense.learning.envs.signals import Signals
 from capsense.reading import Reading
 from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor
+from capsense.readout.config import make_readout
+from capsense.readout.noise import RandomWalk
 from capsense.readout.presets import chip_of
 from capsense.scene import Material, Pose
 from capsense.simulator import PresetName, Simulator
@@ -69,18 +75,29 @@ class Drawn:
         sex = "female" if self.female > 0.5 else "male"
         return Build(sex, percentile=self.percentile, girth=self.girth)  # type: ignore[arg-type]
 
-    def readout(self, chip: str, electrodes: tuple[str, ...], rng: Generator) -> Readout:
-        """The readout of one sensor, at the chip's highest rate, with a gain of its own.
+    def readout(self, chip: Readout | str | Path, sensor: Simulator, rng: Generator) -> Readout:
+        """The readout of one sensor, with a gain of its own.
+
+        A chip by its name has its highest rate, and the noise that was drawn. A file or a readout
+        keeps its rate and its noise; gain, drift and latency come on top.
 
         Raises:
-            ReadoutError: There is no such chip.
+            ReadoutError: There is no such chip or file, or the file is wrong.
         """
-        rate = max(r.per_second for r in chip_of(chip).rates)
         gain = 1.0 + self.gain * rng.uniform(-1.0, 1.0)
         stage = LinearSensor(np.array(gain), np.array(0.0), np.array(0.0), 0.0)
-        return Readout.preset(
-            chip, electrodes, rate=rate, latency=self.latency, white=self.noise,
-            walk=self.drift, stages=(stage,),
+        if isinstance(chip, str) and not chip.endswith(".toml"):
+            rate = max(r.per_second for r in chip_of(chip).rates)
+            return Readout.preset(
+                chip, sensor.electrode_names, rate=rate, latency=self.latency, white=self.noise,
+                walk=self.drift, stages=(stage,),
+            )  # fmt: skip
+        own = make_readout(chip, sensor)
+        walk = (RandomWalk(self.drift),) if self.drift else ()
+        plan = dataclasses.replace(own.schedule, latency=own.schedule.latency + self.latency)
+        return Readout(
+            own.bank, plan, own.law, dac=own.dac, wiring=own.wiring, detector=own.detector,
+            stages=(stage, *own.stages, *walk), seed=own.seed,
         )  # fmt: skip
 
 
@@ -159,6 +176,20 @@ class Randomisation:
         return float(low * (high / low) ** share if name in _LOG else low + share * (high - low))
 
 
+@contextmanager
+def _without_estimates() -> Iterator[None]:
+    """No warnings of large estimated errors.
+
+    The estimates count the robot's own links beside the sensors too, which are tared away; and
+    ranges of randomisation go from within touch to out of sight. ``skin.read()`` tells them all
+    the same, as ``stats.solver_error``.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"sensor .*the reading is rough", UserWarning)
+        warnings.filterwarnings("ignore", r".*large estimated errors?", UserWarning)
+        yield
+
+
 class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     """Capacitive sensors on a moving body, and a person's arm.
 
@@ -169,17 +200,20 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
 
     Args:
         randomisation: What episodes draw from, or some of its ranges by name.
-        chip: Name of the chip behind every sensor.
+        chip: Name of the chip behind every sensor, a readout file, or a readout.
         preset: How finely the solver resolves surfaces.
         design: Sensor design, instead of the task's own; or a simulator, whose field is shared.
+        normalise: Whether changes of capacitance are within ±1, see
+            :func:`~capsense.learning.envs.scale.compressed`.
+        render_mode: None, or ``"rgb_array"``: pictures by MuJoCo's rays, without OpenGL.
 
     Raises:
         SceneError: A range of the randomisation is wrong.
-        ReadoutError: There is no such chip.
+        ReadoutError: There is no such chip or file, or the file is wrong.
         DesignError: The design is wrong.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 25}  # noqa: RUF012, as in Gymnasium
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012, as in Gymnasium
     model_file: ClassVar[str]
     """The MJCF file beside this module; its body ``limb`` is moved by the task."""
     sites: ClassVar[tuple[str, ...]]
@@ -190,16 +224,21 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     """Of the actuators, in their order [m/s or rad/s]."""
     parts: ClassVar[tuple[str, ...]]
     """Segments of the arm that are there."""
+    camera: ClassVar[Camera] = Camera((0.4, -0.6, 0.25), (0.06, 0.0, -0.02))
+    """Where pictures are taken from."""
     extra: ClassVar[tuple[str, ...]] = ()
     """Names of the numbers that :meth:`also` adds to observations."""
 
     def __init__(
         self,
         randomisation: Randomisation | Mapping[str, Sequence[float]] | None = None,
-        chip: str = "fdc1004",
+        chip: Readout | str | Path = "fdc1004",
         preset: PresetName = "fast",
         design: AnyDesign | None = None,
+        normalise: bool = False,
+        render_mode: str | None = None,
     ) -> None:
+        self._normalise, self.render_mode = normalise, render_mode
         self.randomisation = Randomisation.of(randomisation)
         self._chip = chip
         own = design or self.own_design
@@ -237,10 +276,11 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode with a new person, place and chip; ``options`` are not used."""
         self.prepare(seed)
-        self.attach()
-        tare = self.skin.read()
-        self.present()
-        return self.switch_on(tare, self.skin.read())
+        with _without_estimates():
+            self.attach()
+            tare = self.skin.read()
+            self.present()
+            return self.switch_on(tare, self.skin.read())
 
     def step(
         self, action: NDArray[np.float32]
@@ -251,7 +291,30 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
             SceneError: The action has another shape, or is not finite.
         """
         reward, over, facts = self.advance(action)
-        return self.observe(self.skin.read()), reward, over, False, facts
+        with _without_estimates():
+            return self.observe(self.skin.read()), reward, over, False, facts
+
+    def render(self) -> Any:
+        """A picture of the scene, shape (240, 320, 3); electrodes are drawn the redder, the more
+        they feel. None without ``render_mode="rgb_array"``.
+        """
+        if self.render_mode is None:
+            return None
+        surfaces = [e.surface.triangles for e in self.simulator.design.electrodes]
+        electrodes = [
+            (self.data.site(site), triangles, float(strength))
+            for site in self.sites
+            for triangles, strength in zip(surfaces, self._loud(site), strict=True)
+        ]
+        return draw_world(self.model, self.data, self.camera, electrodes)
+
+    def _loud(self, site: str) -> Array:
+        """How much each electrode of a sensor feels, from 0 to 1; by other channels, their mean."""
+        n, felt = len(self.simulator.electrode_names), self.signals.felt.get(site)
+        if felt is None:
+            return np.zeros(n)
+        loud = np.abs(compressed(felt))
+        return loud if len(loud) == n else np.full(n, loud.mean())
 
     # -- the same in parts, between which somebody reads the sensors -----------------------------
 
@@ -338,9 +401,9 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         self._move_limb(self.limb_pose(0.0))
         self.start()
         mujoco.mj_forward(self.model, self.data)
-        names = self.simulator.electrode_names
         self.signals = Signals(
-            {site: self.drawn.readout(self._chip, names, rng) for site in self.sites}
+            {site: self.drawn.readout(self._chip, self.simulator, rng) for site in self.sites},
+            self._normalise,
         )
 
     def make_limb(self) -> Limb:

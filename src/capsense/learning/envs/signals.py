@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 
 from capsense.adapters import mujoco as adapter
 from capsense.errors import SceneError
-from capsense.learning.scenes import settled, settling
+from capsense.learning.chips import settled, settling
+from capsense.learning.envs.scale import LIMIT, TARES, UNIT, compressed
 from capsense.reading import Reading
 from capsense.readout import SEED_STRIDE, Readout
 from capsense.readout.config import make_readout
@@ -28,12 +30,6 @@ from capsense.skin import AnyDesign
 
 KEY = "capacitive"
 """What the observation that is added is called."""
-UNIT = 10e-15
-"""Changes of capacitance are given in this unit [F]."""
-LIMIT = 100.0
-"""Numbers are held within ± this."""
-TARES = 16
-"""Conversions of a channel that its zero is the mean of."""
 _OLDEST = 1.0
 """Ages are held below this [s]."""
 
@@ -43,12 +39,16 @@ class Signals:
 
     Args:
         readouts: The readout of each sensor, by name.
+        normalise: Whether changes are within ±1, by
+            :func:`~capsense.learning.envs.scale.compressed`.
     """
 
-    def __init__(self, readouts: Mapping[str, Readout]) -> None:
-        self.readouts = dict(readouts)
+    def __init__(self, readouts: Mapping[str, Readout], normalise: bool = False) -> None:
+        self.readouts, self.normalise = dict(readouts), normalise
         self.tare: dict[str, NDArray[np.float64]] = {}
         """Zero of every channel [F], by sensor."""
+        self.felt: dict[str, NDArray[np.float64]] = {}
+        """What was read last [10 fF], by sensor."""
 
     def reset(
         self, time: float, seed: int, tare: Mapping[str, Reading], now: Mapping[str, Reading]
@@ -87,11 +87,14 @@ class Signals:
     @property
     def limits(self) -> NDArray[np.float32]:
         """No number of :meth:`read` is further from zero than this, shape (size,)."""
-        most = [_OLDEST if name.endswith(".age") else LIMIT for name in self.names]
+        largest = 1.0 if self.normalise else LIMIT
+        most = [_OLDEST if name.endswith(".age") else largest for name in self.names]
         return np.array(most, np.float32)
 
     def read(self, time: float, now: Mapping[str, Reading]) -> NDArray[np.float32]:
         """Of each sensor: change of every channel since the tare [10 fF], then their ages [s].
+
+        Normalised changes are numbers within ±1.
 
         Args:
             time: The simulator's time [s].
@@ -100,8 +103,10 @@ class Signals:
         out = []
         for name, chip in self.readouts.items():
             held = chip.sample(time, now[name]).held()
-            change = (held.capacitance - self.tare[name]) / UNIT
-            out += [np.clip(change, -LIMIT, LIMIT), np.minimum(held.age, _OLDEST)]
+            change = np.clip((held.capacitance - self.tare[name]) / UNIT, -LIMIT, LIMIT)
+            self.felt[name] = change
+            change = compressed(change) if self.normalise else change
+            out += [change, np.minimum(held.age, _OLDEST)]
         return np.concatenate(out).astype(np.float32)
 
 
@@ -118,7 +123,10 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         env: An environment with ``unwrapped.model`` and ``unwrapped.data`` of MuJoCo.
         sites: Sites that carry sensors; see :func:`write_model` where there are none.
         design: What :func:`capsense.adapters.mujoco.attach_skin` takes.
-        readout: Name of the chip behind every sensor, or a readout file.
+        readout: Name of the chip behind every sensor, a readout file, or a readout, of which every
+            sensor has a copy.
+        normalise: Whether changes of capacitance are within ±1, see
+            :func:`~capsense.learning.envs.scale.compressed`.
         options: As for ``attach_skin``: ``materials``, ``grounding``, ``exclude`` and so on.
 
     Raises:
@@ -133,10 +141,12 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         env: gymnasium.Env[Any, Any],
         sites: Sequence[str],
         design: AnyDesign = DEFAULT_DESIGN,
-        readout: str | Path = "fdc1004",
+        readout: Readout | str | Path = "fdc1004",
+        normalise: bool = False,
         **options: Any,
     ) -> None:
-        how = {"sites": sites, "design": design, "readout": readout, **options}
+        how = {"sites": sites, "design": design, "readout": readout, "normalise": normalise,
+               **options}  # fmt: skip
         RecordConstructorArgs.__init__(self, **how)
         gymnasium.ObservationWrapper.__init__(self, env)
         self._how = how
@@ -180,10 +190,13 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         inner: Any = self.env.unwrapped
         self._model = inner.model
         how = self._how.copy()
-        readout = how.pop("readout")
+        readout, normalise = how.pop("readout"), how.pop("normalise")
         self.skin = adapter.attach_skin(inner.model, inner.data, **how, threads=1)
         sensors = {} if readout is None else self.skin.sensors
-        self.signals = Signals({n: make_readout(readout, s.simulator) for n, s in sensors.items()})
+        self.signals = Signals(
+            {n: copy.deepcopy(make_readout(readout, s.simulator)) for n, s in sensors.items()},
+            normalise,
+        )
 
 
 def write_model(env_id: str, body: str, pose: Pose, path: str | Path, name: str = "pad") -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.learning.envs.base import CapacitiveEnv
+from capsense.learning.envs.picture import Camera
 from capsense.scene import Pose
 
 Array = NDArray[np.float64]
@@ -192,6 +193,7 @@ class ApproachStop(CapacitiveEnv):
     speeds = (0.6, 0.3, 0.3)
     parts = ("upper_arm", "forearm", "hand")
     extra = ("left",)
+    camera = Camera((1.3, -1.2, 1.0), (0.35, 0.0, 0.2))
 
     def begin(self) -> dict[str, float]:
         build = self.drawn.build

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -18,6 +18,7 @@ from capsense.adapters.rules import Rules
 from capsense.adapters.world import Solid
 from capsense.errors import SceneError
 from capsense.fleet import Fleet
+from capsense.learning.envs.autoreset import autoreset_of, ended, seeds_of
 from capsense.learning.envs.base import CapacitiveEnv
 from capsense.learning.envs.tasks import ApproachStop, Dressing, LimbFollow
 from capsense.reading import Reading, StepStats
@@ -130,20 +131,22 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
     """Environments of one kind side by side; one call of a fleet reads all their sensors.
 
     Spaces, rewards, facts and random numbers are those of single environments. An environment
-    whose episode has ended begins another at the next step, whatever its action
-    (``AutoresetMode.NEXT_STEP``).
+    whose episode has ended begins another at the next step, whatever its action, or in the same
+    step: the last observations and facts are then ``final_obs`` and ``final_info`` among the
+    facts, as of Gymnasium.
 
     Args:
         num_envs: How many there are.
         max_episode_steps: Episodes are cut after so many steps; None for no limit.
         device: What reads the sensors: ``"cpu"``, or a device of Warp, as of
             :class:`~capsense.fleet.Fleet`.
+        autoreset_mode: ``"NextStep"`` or ``"SameStep"``, or as ``AutoresetMode``.
         options: Those of a single environment.
 
     Raises:
-        ValueError: ``num_envs`` is not a whole number from 1.
+        ValueError: ``num_envs`` is not a whole number from 1, or there is no such mode.
         SceneError: An option is wrong.
-        ReadoutError: There is no such chip.
+        ReadoutError: There is no such chip or file, or the file is wrong.
         DesignError: The design is wrong.
     """
 
@@ -155,8 +158,10 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         num_envs: int = 1,
         max_episode_steps: int | None = None,
         device: str = "cpu",
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
+        self._mode = autoreset_of(autoreset_mode)
         if (as_whole(num_envs) or 0) < 1:
             raise ValueError(f"num_envs is {num_envs!r}; give a whole number from 1")
         num_envs = int(num_envs)
@@ -165,7 +170,8 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self.worlds = [first, *(self.world(**shared) for _ in range(num_envs - 1))]
         """The environments, which nobody else may step."""
         self.num_envs, self._limit = num_envs, max_episode_steps
-        self.metadata = {**first.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}
+        self.metadata = {**first.metadata, "autoreset_mode": self._mode}
+        self.render_mode = first.render_mode
         self.single_observation_space = first.observation_space
         self.single_action_space = first.action_space
         self.observation_space = batch_space(first.observation_space, num_envs)
@@ -190,15 +196,7 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         Raises:
             SceneError: Another number of seeds, or a mask of another shape.
         """
-        n = self.num_envs
-        seeds: list[int | None] = [None] * n
-        if (first := as_whole(seed)) is not None:
-            seeds = [first + k for k in range(n)]
-        elif seed is not None:
-            seeds = list(cast("Sequence[int | None]", seed))
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(n, np.bool_)))
-        if len(seeds) != n or mask.shape != (n,) or mask.dtype != np.bool_:
-            raise SceneError(f"reset: give {n} seeds, and a mask of {n} booleans")
+        seeds, mask = seeds_of(seed, options, self.num_envs)
         infos: dict[str, Any] = {}
         self._begin(mask, seeds)
         for k, (observation, facts) in self._begun(mask).items():
@@ -234,7 +232,38 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             infos = self._add_info(infos, facts, k)
         cut = ~new & (self._steps >= (self._limit or np.inf))
         self._over = over | cut
+        if self._over.any() and self._mode == AutoresetMode.SAME_STEP:
+            infos = self._begin_at_once(infos)
         return self._observations.copy(), rewards, over, cut, infos
+
+    def _begin_at_once(self, infos: dict[str, Any]) -> dict[str, Any]:
+        """Begin new episodes where old ones have ended in this step; the facts of all."""
+        new = self._over.copy()
+        out = ended(new, self._observations, infos)
+        self._begin(new, [None] * self.num_envs)
+        begun = self._begun(new)
+        for k in range(self.num_envs):
+            if k in begun:
+                self._observations[k], facts = begun[k]
+            else:
+                facts = {
+                    name: value[k] for name, value in infos.items()
+                    if not name.startswith("_") and infos[f"_{name}"][k]
+                }  # fmt: skip
+            out = self._add_info(out, facts, k)
+        return out
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A picture of each environment; None without ``render_mode="rgb_array"``."""
+        if self.render_mode is None:
+            return None
+        return tuple(world.render() for world in self.worlds)
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the environments."""
+        for world in self.worlds:
+            world.close()
+        super().close(**kwargs)
 
     def _begin(self, mask: Bools, seeds: Sequence[int | None]) -> None:
         """Build the worlds of new episodes, and read what their chips are tared on."""
