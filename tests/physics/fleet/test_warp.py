@@ -415,13 +415,14 @@ def test_wide_bodies_are_near_the_fine_preset() -> None:
 
 
 def test_panels_of_wide_bodies_are_more() -> None:
-    """Unit: four times as many for a table, as usual for a finger; and energies of all of them."""
-    table, finger = cs.Body(cs.Box((0.5, 0.4, 0.02))), cs.Body(cs.Capsule(0.008, 0.06))
+    """Unit: a table has four times as many as a small box, and energies of all of them."""
+    table, block = cs.Body(cs.Box((0.5, 0.4, 0.02))), cs.Body(cs.Box((0.12, 0.1, 0.02)))
     usual, wide = (
-        cs.Fleet("six_patch", [body], 1, device="warp:cpu", budget=32).table.shapes[0].panels
-        for body in (finger, table)
+        cs.Fleet("six_patch", [body], 1, device="warp:cpu", budget=32).table.shapes[0]
+        for body in (block, table)
     )
-    assert 3 * len(usual) < len(wide) < 6 * len(usual)
+    assert 3 * len(usual.panels) < len(wide.panels) < 5 * len(usual.panels)
+    assert wide.potential_coefficients.shape == (len(wide.panels),) * 2
 
 
 def test_wide_bodies_are_warned_of_once() -> None:
