@@ -414,6 +414,18 @@ def test_wide_bodies_are_near_the_fine_preset() -> None:
     assert off.max() < 0.05
 
 
+def test_a_wall_beyond_the_box_leaves_a_definite_matrix() -> None:
+    """Differential: clusters at a wall of the box meet images more than themselves. Measured 0.05;
+    1e6 without ``bound_walls``."""
+    body = cs.Body(cs.Box((2.223, 2.701, 0.099)))
+    turn = np.array([-0.0154, -0.9926, 0.1201, -0.0075])
+    where = np.array([[[0.7565, -0.975, 0.3928, *turn / np.linalg.norm(turn)]]])
+    fleet = cs.Fleet("six_patch_bare", [body], 1, device="warp:cpu")
+    truth = cs.Fleet("six_patch_bare", [body], 1, preset="fine").step(where).delta
+    off = np.abs(fleet.step(where).delta.numpy() - truth).max()
+    assert off < 0.1 * np.abs(truth).max()
+
+
 def test_panels_of_wide_bodies_are_more() -> None:
     """Unit: a table has four times as many as a small box, and energies of all of them."""
     table, block = cs.Body(cs.Box((0.5, 0.4, 0.02))), cs.Body(cs.Box((0.12, 0.1, 0.02)))
