@@ -204,6 +204,7 @@ class CapacitanceReading(NamedTuple):
     """Time since the results could be read [s], infinite where there is none, the same shape."""
 
 
+_IMPERFECTIONS = ("resolution", "bias", "random_walk", "noise")
 _NOISY = 2
 """So many of these first have the noise, bias and resolution of Genesis's options."""
 
@@ -282,6 +283,8 @@ class CapacitanceMetadata(SimpleSensorMetadata):
     """Their fleets."""
     manager: Any = None
     """Genesis's manager of all sensors."""
+    imperfect: bool = False
+    """Whether any has noise, bias or a resolution."""
 
     @property
     def scene(self) -> Any:
@@ -350,9 +353,20 @@ class CapacitanceSensor(SimpleSensor[Capacitance, None, CapacitanceMetadata, Cap
         metadata = self._shared_metadata
         metadata.manager = self._manager
         metadata.asked.append(_Asked(self._options, self._sites(), self._cache_size))
+        self._keep_clean()
+
+    def _set_metadata_field(self, *args: Any, **options: Any) -> None:
+        super()._set_metadata_field(*args, **options)
+        self._keep_clean()
+
+    def _keep_clean(self) -> None:
+        """Leave all but the capacitances without noise, bias and resolution."""
+        metadata = self._shared_metadata
         clean = slice(self._cache_offset + self._noisy(), self._cache_offset + self._cache_size)
-        for name in ("resolution", "bias", "random_walk", "noise"):
-            getattr(metadata, name)[:, clean] = 0.0
+        given = [getattr(metadata, name) for name in _IMPERFECTIONS]
+        for values in given:
+            values[:, clean] = 0.0
+        metadata.imperfect = any(bool(values.any()) for values in given)
 
     def _noisy(self) -> int:
         """How many of the first numbers are capacitances."""
@@ -423,6 +437,19 @@ class CapacitanceSensor(SimpleSensor[Capacitance, None, CapacitanceMetadata, Cap
         cls, shared_context: None, shared_metadata: CapacitanceMetadata, raw_data_T: torch.Tensor
     ) -> None:
         shared_metadata.read(raw_data_T)
+
+    @classmethod
+    def _apply_hardware_imperfections(
+        cls, shared_metadata: CapacitanceMetadata, measured_slot_0: torch.Tensor
+    ) -> None:
+        """Do as Genesis does, but also where numbers are as small as capacitances are [F]."""
+        given, data = shared_metadata, measured_slot_0
+        if not given.imperfect:
+            return
+        given._cur_random_walk += torch.normal(0.0, given.random_walk)
+        data += given._cur_random_walk + given.bias + torch.normal(0.0, given.noise)
+        step = given.resolution
+        data.copy_(torch.where(step > 0.0, torch.round(data / step) * step, data))
 
     def _draw_debug(self, context: Any, envs_idx: list[int]) -> list[tuple[None, Any, None]]:
         """Make meshes of the electrodes, coloured by the signals of the first rendered one."""
