@@ -1,12 +1,20 @@
 """Stands for Isaac Lab 3, which needs a GPU: what ``capsense.adapters.isaac_lab`` uses of it.
 
-The names, arguments and the order of calls are those of ``isaaclab.sensors.SensorBase``,
-``isaaclab.markers.VisualizationMarkers`` and ``isaaclab_newton.physics.NewtonManager`` of Isaac Lab
-3.0, as its repository has them in autumn 2026: timestamps in single precision and masks of what is
-outdated for each environment; ``reset`` clears the mask, so that data are read anew after the next
-``update`` only; ``update`` reads at once while it draws. The manager's methods for sites have the
-prefix ``cl_`` in some versions. Behind the manager is a real Newton model. Configuration classes
-are plain dataclasses here.
+Names, arguments and the order of calls were compared with these files of the public repository
+isaac-sim/IsaacLab, each at a commit of 2026, and with no released tag:
+
+- ``isaaclab/sensors/sensor_base.py`` and ``isaaclab_newton/physics/newton_manager.py`` at
+  001515cbcc9e, where the methods for sites have the prefix ``cl_``;
+- ``isaaclab_newton/sensors/imu/imu.py`` at 1d4899f16306, which calls them without the prefix;
+- ``isaaclab/sensors/kernels.py`` at 153a1e5c2ea3;
+- ``isaaclab/markers/vis_marker_registry.py`` at 25d744b82ce7 and
+  ``isaaclab/markers/newton_visualization_markers.py`` at 0bbc9347e27a.
+
+What the tests rely on: timestamps in single precision and masks of what is outdated for each
+environment; ``reset`` clears the mask, so that data are read anew after the next ``update`` only;
+``update`` reads at once while it draws; markers are blocks of one for each environment, with
+quaternions (x, y, z, w). Behind the manager is a real Newton model. Configuration classes are plain
+dataclasses here.
 """
 
 from __future__ import annotations

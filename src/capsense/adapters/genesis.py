@@ -196,13 +196,15 @@ class CapacitanceReading(NamedTuple):
     total: torch.Tensor
     """Force that the whole cover carries [N], 0 without a cover."""
     codes: torch.Tensor
-    """What the chips' registers hold, whole numbers, (…, k); (…, 0) without a readout."""
+    """What the chips' registers hold, whole numbers, (…, k); (…, 0) without a readout. In Genesis's
+    single precision they are exact up to 24 bits, with ``gs.init(precision="64")`` all are."""
     measured: torch.Tensor
     """What a user makes of the codes [F], the same shape."""
     ages: torch.Tensor
     """Time since the results could be read [s], infinite where there is none, the same shape."""
 
 
+_IMPERFECTIONS = ("resolution", "bias", "random_walk", "noise")
 _NOISY = 2
 """So many of these first have the noise, bias and resolution of Genesis's options."""
 
@@ -212,7 +214,8 @@ class Capacitance(
 ):
     """Options of capacitive proximity sensors, for ``scene.add_sensor``.
 
-    ``read()`` gives a :class:`CapacitanceReading`. Genesis's own options for noise, bias and
+    ``read()`` gives a :class:`CapacitanceReading`; from a reset to the next step it is that of a
+    sensor in an empty environment, at 0 s, without codes. Genesis's own options for noise, bias and
     resolution make something of the capacitances alone; those for delay, jitter and history are for
     all of it. With ``draw_debug`` electrodes are drawn, coloured by the signals of the first
     environment that is drawn.
@@ -278,7 +281,15 @@ class CapacitanceMetadata(SimpleSensorMetadata):
     """The sensors, in order."""
     groups: list[_Group] = field(default_factory=list)
     """Their fleets."""
-    scene: Any = None
+    manager: Any = None
+    """Genesis's manager of all sensors."""
+    imperfect: bool = False
+    """Whether any has noise, bias or a resolution."""
+
+    @property
+    def scene(self) -> Any:
+        """The scene of the sensors."""
+        return self.manager._sim.scene
 
     def start(self) -> None:
         """Make one fleet for all sensors of one design and the same options."""
@@ -340,11 +351,22 @@ class CapacitanceSensor(SimpleSensor[Capacitance, None, CapacitanceMetadata, Cap
         """Take note of the sensor; fleets are made when the scene is."""
         super().build()
         metadata = self._shared_metadata
-        metadata.scene = self._manager._sim.scene
+        metadata.manager = self._manager
         metadata.asked.append(_Asked(self._options, self._sites(), self._cache_size))
+        self._keep_clean()
+
+    def _set_metadata_field(self, *args: Any, **options: Any) -> None:
+        super()._set_metadata_field(*args, **options)
+        self._keep_clean()
+
+    def _keep_clean(self) -> None:
+        """Leave all but the capacitances without noise, bias and resolution."""
+        metadata = self._shared_metadata
         clean = slice(self._cache_offset + self._noisy(), self._cache_offset + self._cache_size)
-        for name in ("resolution", "bias", "random_walk", "noise"):
-            getattr(metadata, name)[:, clean] = 0.0
+        given = [getattr(metadata, name) for name in _IMPERFECTIONS]
+        for values in given:
+            values[:, clean] = 0.0
+        metadata.imperfect = any(bool(values.any()) for values in given)
 
     def _noisy(self) -> int:
         """How many of the first numbers are capacitances."""
@@ -399,12 +421,35 @@ class CapacitanceSensor(SimpleSensor[Capacitance, None, CapacitanceMetadata, Cap
             worlds[envs_idx] = True
             group.sensors.reset(worlds)
             shared_metadata.enter(group, shared_ground_truth_cache)
+        if shared_metadata.groups:  # Genesis has set to zero what a read gives
+            blank = shared_ground_truth_cache.T[envs_idx]
+            manager = shared_metadata.manager
+            for caches in (manager._return_cache, manager._ground_truth_return_cache):
+                caches[cls][envs_idx] = blank
+            for rings in (
+                manager._measured_return_timeline_ring, manager._ground_truth_return_timeline_ring,
+            ):  # fmt: skip
+                if cls in rings:
+                    rings[cls].buffer[:, envs_idx] = blank
 
     @classmethod
     def _update_raw_data(
         cls, shared_context: None, shared_metadata: CapacitanceMetadata, raw_data_T: torch.Tensor
     ) -> None:
         shared_metadata.read(raw_data_T)
+
+    @classmethod
+    def _apply_hardware_imperfections(
+        cls, shared_metadata: CapacitanceMetadata, measured_slot_0: torch.Tensor
+    ) -> None:
+        """Do as Genesis does, but also where numbers are as small as capacitances are [F]."""
+        given, data = shared_metadata, measured_slot_0
+        if not given.imperfect:
+            return
+        given._cur_random_walk += torch.normal(0.0, given.random_walk)
+        data += given._cur_random_walk + given.bias + torch.normal(0.0, given.noise)
+        step = given.resolution
+        data.copy_(torch.where(step > 0.0, torch.round(data / step) * step, data))
 
     def _draw_debug(self, context: Any, envs_idx: list[int]) -> list[tuple[None, Any, None]]:
         """Make meshes of the electrodes, coloured by the signals of the first rendered one."""

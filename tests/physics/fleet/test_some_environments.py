@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,47 @@ def test_chips_of_others_stand_still(device):
     held = both.step(where, time=clocks, environments=[1]).held
     assert not host(held.code)[0].any()
     assert np.isinf(host(held.age)[0]).all()
+
+
+@pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
+def test_chips_of_each_sensor_stand_still(device):
+    """Differential: two sensors with readouts of their own, against a fleet of each environment."""
+    if device != "cpu":
+        pytest.importorskip("warp")
+
+    def fleet(count):
+        ball = [cs.Body(cs.Sphere(0.01))]
+        out = cs.Fleet("patch", ball, count, sensors=2, device=device, budget=32)
+        quiet = cs.Readout.preset("ad7147", out.electrode_names, noise=False)
+        bank, law = quiet.bank, quiet.law
+        slow = replace(quiet.schedule, idle=quiet.schedule.period)
+        out.use_readout([
+            cs.Readout(bank, schedule, law, wiring=quiet.wiring)
+            for schedule in (quiet.schedule, slow)
+        ])  # fmt: skip
+        return out
+
+    both, alone = fleet(2), [fleet(1), fleet(1)]
+    where = np.zeros((2, 1, 7))
+    where[..., 6] = 1.0
+    at = np.zeros((2, 2, 7))
+    at[..., 6], at[:, 1, 0] = 1.0, 0.01
+    clocks, before = np.zeros(2), None
+    for k in range(6):
+        e = k % 2 if k < 4 else 1
+        where[e, 0, 2] = 0.02 + 0.002 * k
+        clocks[e] += 0.05
+        given = np.where(np.arange(2) == e, clocks, 7.0)  # the clocks of others are not looked at
+        held = both.step(where, at, time=given, environments=[e]).held
+        truth = alone[e].step(where[e : e + 1], at[e : e + 1], time=clocks[e]).held
+        np.testing.assert_array_equal(host(held.code)[e], host(truth.code)[0])
+        np.testing.assert_allclose(host(held.age)[e], host(truth.age)[0], rtol=1e-9)
+        other = host(held.code)[1 - e], host(held.age)[1 - e]
+        if before is not None:
+            np.testing.assert_array_equal(other, before[1 - e])
+        before = list(zip(host(held.code), host(held.age), strict=True))
+    assert host(held.code).all()
+    assert (host(held.age)[:, 0] != host(held.age)[:, 1]).any()
 
 
 def test_refused():
