@@ -51,7 +51,9 @@ def cut_of(
 ) -> ActiveTree:
     """Clusters by what is largest against its distance from the design, ``count`` for each body.
 
-    What crosses a wall counts as larger, by twice its share of the body's length.
+    What crosses a wall counts as larger, by twice its share of the body's length. Of wide bodies,
+    which have more than 12 functions for each cluster, clusters count by the fourth root of s³/d⁴
+    for an extent s and a distance d, and four times the share.
     Those that are not split have one function more, which is not solved for, and are represented by
     themselves none the less. Of clusters that are as large to 1e-5, those are split whose functions
     are ``favoured``.
@@ -69,7 +71,10 @@ def cut_of(
         )
         crossing = _smooth(2.0 - 4.0 * np.abs(room) / (size + 1e-9))
         crossing *= _smooth((size - 0.03) / 0.03) * tree.extent / tree.extent[0]
-        need += np.where(tree.children[:, 0] < 0, 0.0, 2.0 * crossing)
+        wide = (len(tree.extent) + 1) // 2 > 12 * count
+        if wide:
+            need *= (tree.extent[0] / tree.extent) ** 0.25
+        need += np.where(tree.children[:, 0] < 0, 0.0, (4.0 if wide else 2.0) * crossing)
         if favoured:
             need *= 1.0 + 1e-5 * np.isin(tree.function, favoured[b])
         heap, split = [(-need[0], 0)], set()
@@ -225,5 +230,9 @@ def twin_of(fleet: cs.Fleet) -> cs.Simulator:
     (near, _, far), (_, start) = green.levels, green.blends
     simulator._solver.green = green._replace(
         levels=(near, far, far), blends=np.array([start, start + 1.0])
+    )
+    usual = simulator._solver.functions_of
+    simulator._solver.functions_of = lambda shape, conducting, share=1.0: usual(
+        shape, conducting, share * fleet.table.share(shape)
     )
     return simulator

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_whole, shorten
 from capsense.errors import SceneError
-from capsense.scene import Body, Layers, SurfaceMesh
+from capsense.scene import Body, Layers, Shape, SurfaceMesh
 from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import windowed
 from capsense.solver.surface_solver import SurfaceSolver
 from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.fine_panels import WIDE
 from capsense.solver.tree.matter import matter_of
 from capsense.solver.tree.rigid import BODY, RigidShape
 
@@ -41,6 +43,9 @@ def host_array(values: Any) -> Any:
 
 _EACH = ("choice", "scale", "inverse_susceptibility", "ground_elastance", "neutral", "slack")
 """What :class:`Bodies` have for every environment."""
+
+_DOUBLINGS = 2
+"""Panels of a body are doubled at most so often where they are wide, see :class:`BodyTable`."""
 
 
 class Bodies(NamedTuple):
@@ -82,10 +87,15 @@ class BodyTable:
     Args:
         solver: Works out what is known of a shape.
         count, places, sensors: How many environments, places in each, and sensors.
+        width: The panels of a body are doubled, at most twice, as long as they are wider than this
+            on average [m]; by default they are as many as usual.
     """
 
-    def __init__(self, solver: SurfaceSolver, count: int, places: int, sensors: int) -> None:
-        self._solver = solver
+    def __init__(
+        self, solver: SurfaceSolver, count: int, places: int, sensors: int,
+        width: float = math.inf,
+    ) -> None:  # fmt: skip
+        self._solver, self._width = solver, width / solver.length
         self.count, self.places, self.sensors = count, places, sensors
         self.shapes: list[RigidShape | DynamicBody] = []
         """Those in the table, in its order; records point to their arrays."""
@@ -196,13 +206,28 @@ class BodyTable:
             )
         whole = body.shape.measured_in(length)
         window, _ = windowed(whole, np.zeros(3), self._solver.reach)
-        shape, size = self._solver.functions_of(window, bool(matter.conducting[0]))
+        shape, size = self._solver.functions_of(
+            window, bool(matter.conducting[0]), self.share(window)
+        )
         tie = complex(matter.ties(np.array([size * shape.capacitance]))[0])
         neutral = int(np.isinf(tie.real))
         soft = complex(matter.inverse_susceptibility[0])
         number = self._number(shape, soft != 0.0)
         cut = 0.5 * np.ptp(whole.bounds(), axis=0) - 0.5 * np.ptp(window.bounds(), axis=0)
         return number, size, soft, 0.0 if neutral else tie, neutral, cut
+
+    def share(self, shape: Shape) -> float:
+        """How many times the usual panels a wide shape has, whose lengths are over ``length``.
+
+        Of clusters that are few, those in front of the design can be small only if panels are.
+        """
+        low, middle, high = np.ptp(shape.bounds(), axis=0).tolist()
+        if sorted((low, middle, high))[1] * self._solver.length <= WIDE:
+            return 1.0
+        area = 2.0 * (low * middle + middle * high + high * low)
+        more = area / self._width**2 / self._solver.preset.panels
+        more = math.ceil(math.log2(max(more, 1.0)))
+        return float(2 ** min(more, _DOUBLINGS))
 
     def _number(self, shape: RigidShape | DynamicBody, soft: bool) -> int:
         """The number of a shape in the table, which it joins if it is new."""

@@ -281,6 +281,7 @@ class WarpCore:
         for values in (matrix, turned):
             self.launch(solution.from_functions, (n, views), cut, 1, values)
         self.launch(pairs.pairs, (n, n, views), green, cut, matrix)
+        self.launch(pairs.bound_walls, (n, views), green, cut, rows, matrix)
         self.launch(pairs.bound_images, (n, views), green, cut, rows, matrix)
         self.launch(solution.to_functions, (width, views), cut, 1, rows)
         for values in (matrix, turned):

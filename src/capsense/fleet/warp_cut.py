@@ -31,7 +31,9 @@ four = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 _WIDTH = wp.constant(WIDTH)
 _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
-_CROSSING = wp.constant(2.0)
+_CROSSING, _CROSSED = wp.constant(2.0), wp.constant(4.0)
+_MANY = wp.constant(12)
+"""Bodies of more panels for each cluster are wide ones, see ``BodyTable.share``."""
 _LONG0, _LONG1 = (wp.constant(x) for x in LONG)
 _LIFTED, _WALL_PENALTY = wp.constant(LIFTED), wp.constant(WALL_PENALTY)
 _DEEP, _BEHIND = wp.constant(DEEP[0]), wp.constant(DEEP[1])
@@ -44,7 +46,8 @@ class Shapes:
 
     first: wp.array(dtype=wp.int32)  # first cluster of a shape
     functions: wp.array(dtype=wp.int32)  # how many functions have energies
-    block: wp.array(dtype=wp.int64)  # where its energies begin
+    block: wp.array(dtype=wp.int64)  # where its energies begin …
+    inside: wp.array(dtype=wp.int64)  # … and its impedances, if it is a dielectric's
     radius: wp.array(dtype=wp.float32)
     children: wp.array2d(dtype=wp.int32)  # parts of a cluster, from 0 within the shape; -1 for none
     function: wp.array(dtype=wp.int32)
@@ -143,7 +146,7 @@ def smooth(x: float):
 
 
 @wp.func
-def _off(p: wp.vec3, low: wp.vec3, high: wp.vec3):
+def off_box(p: wp.vec3, low: wp.vec3, high: wp.vec3):
     """How far a point is from a box along each axis."""
     return wp.vec3(
         wp.max(wp.max(low[0] - p[0], p[0] - high[0]), 0.0),
@@ -161,24 +164,31 @@ def _unit(pose: wp.transform):
 
 @wp.func
 def _need(
-    shapes: Shapes, green: Response, at: wp.transform, scale: float, first: int, node: int
+    shapes: Shapes, green: Response, at: wp.transform, scale: float, first: int, node: int,
+    wide: bool,
 ):  # fmt: skip
     """Extent of a cluster over its distance from the design; 0 for a single panel.
 
-    Where it crosses a wall, ``_CROSSING`` times its share of the body's length is added.
+    Of wide bodies: in the field of a charge at a distance d, the function of a cluster of extent s
+    has an energy like s³/d⁴; its fourth root is taken, over that of s⁻¹ for the whole body. Where a
+    cluster crosses a wall, its share of the body's length is added, times a factor.
     """
     if shapes.children[node, 0] < 0:
         return float(0.0)
     size = scale * shapes.extent[node]
     p = wp.transform_point(at, scale * shapes.center[node])
-    away = wp.length(_off(p, green.box0, green.box1))
+    away = wp.length(off_box(p, green.box0, green.box1))
     low = p - green.room0
     high = green.room1 - p
     room = wp.min(wp.min(wp.min(low[0], low[1]), low[2]), wp.min(wp.min(high[0], high[1]), high[2]))
     crossing = smooth(2.0 - 4.0 * wp.abs(room) / (size + 1e-9))
     crossing = crossing * smooth((size / green.extent - _LONG0) / (_LONG1 - _LONG0))
     crossing = crossing * shapes.extent[node] / shapes.extent[first]
-    return size / (wp.max(away, _HALF * size) + _NEAREST) + _CROSSING * crossing
+    near = size / (wp.max(away, _HALF * size) + _NEAREST)
+    if wide:
+        smaller = wp.sqrt(wp.sqrt(shapes.extent[first] / shapes.extent[node]))
+        return smaller * near + _CROSSED * crossing
+    return near + _CROSSING * crossing
 
 
 @wp.func
@@ -228,7 +238,7 @@ def stand(
     cut.pose[b, v] = at
     cut.moved[b, v] = moved
     scale = places.scale[e, b]
-    away = _off(wp.transform_get_translation(at), green.room0, green.room1)
+    away = off_box(wp.transform_get_translation(at), green.room0, green.room1)
     if (
         wp.max(away[0], wp.max(away[1], away[2]))
         > scale * shapes.radius[u] + _WALL_FADE_LENGTH * green.extent
@@ -252,7 +262,8 @@ def choose(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree)
         return
     at = cut.pose[b, v]
     scale = places.scale[e, b]
-    cut.score[o, v] = _need(shapes, green, at, scale, first, first)
+    wide = shapes.functions[places.choice[e, b]] > _MANY * cut.clusters
+    cut.score[o, v] = _need(shapes, green, at, scale, first, first, wide)
     for j in range(1, cut.clusters):
         best = int(0)
         most = float(0.0)
@@ -272,8 +283,8 @@ def choose(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree)
             ) + wp.where(shapes.children[y, 0] < 0, 0.5, 0.0)
             cut.node[o + best, v] = x
             cut.node[o + j, v] = y
-            cut.score[o + best, v] = _need(shapes, green, at, scale, first, x)
-            cut.score[o + j, v] = _need(shapes, green, at, scale, first, y)
+            cut.score[o + best, v] = _need(shapes, green, at, scale, first, x, wide)
+            cut.score[o + j, v] = _need(shapes, green, at, scale, first, y, wide)
         else:
             cut.score[o + j, v] = 0.0
 
@@ -289,7 +300,7 @@ def held_off(distance: float, length: float):
 @wp.func
 def lift(p: wp.vec3, gap: float, green: Response):
     """Keep a point off a flat design, as ``face_kernels.lift``."""
-    away = _off(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
+    away = off_box(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
     way = wp.length(away)
     if way >= 2.0 * gap:
         return p
@@ -322,7 +333,7 @@ def lift(p: wp.vec3, gap: float, green: Response):
 def lift_back(force: wp.vec3, p: wp.vec3, gap: float, green: Response):
     """Force on a point before it is lifted by :func:`lift`, from that on the lifted point."""
     low = wp.vec3(green.box0[0], green.box0[1], p[2])
-    away = _off(p, low, green.box1)
+    away = off_box(p, low, green.box1)
     way = wp.length(away)
     if way >= 2.0 * gap:
         return force
@@ -366,7 +377,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
         points[q] = wp.transform_point(cut.pose[b, v], scale * shapes.points[k, q])
     cut.unlifted[i, v] = points
     c = 0.5 * (points[0] + points[3])
-    off = wp.length(_off(c, green.room0, green.room1))
+    off = wp.length(off_box(c, green.room0, green.room1))
     lifted = int(0)
     deep = float(0.0)
     if green.has_face != 0:
@@ -385,7 +396,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     cut.extent[i, v] = size
     cut.softening_length[i, v] = scale * shapes.softening_length[k]
     cut.outside_fraction[i, v] = smooth(wp.max(off / (_WALL_FADE_LENGTH * green.extent), deep))
-    away = wp.length(_off(0.5 * (points[0] + points[3]), green.box0, green.box1))
+    away = wp.length(off_box(0.5 * (points[0] + points[3]), green.box0, green.box1))
     cut.near[i, v] = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
 
 

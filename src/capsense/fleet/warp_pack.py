@@ -69,8 +69,9 @@ def pack_shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any
     sizes = np.array([len(shape.panels) for shape in shapes])
     blocks = [shape.potential_coefficients.ravel() for shape in shapes]
     soft = bodies.shapes["neumann_to_dirichlet"] != 0
+    none = np.zeros(0, np.float32)  # conductors have no inside
     inside = [
-        (shape.neumann_to_dirichlet if s else np.zeros_like(shape.potential_coefficients)).ravel()
+        shape.neumann_to_dirichlet.ravel() if s else none
         for shape, s in zip(shapes, soft, strict=True)
     ]
 
@@ -80,7 +81,9 @@ def pack_shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any
     out = warp_cut.Shapes()
     out.first = array(np.concatenate([[0], np.cumsum(2 * sizes - 1)[:-1]]), wp.int32)
     out.functions = array(sizes, wp.int32)
-    out.block = array(np.concatenate([[0], np.cumsum(sizes**2)[:-1]]), wp.int64)
+    for name, parts in (("block", blocks), ("inside", inside)):
+        ends = np.cumsum([0, *map(len, parts)])
+        setattr(out, name, array(ends[:-1], wp.int64))
     out.radius = array(bodies.radius, wp.float32)
     for name, kind in (
         ("children", wp.int32), ("function", wp.int32), ("charge", wp.float32), ("center", wp.vec3),

@@ -17,6 +17,7 @@ from capsense.fleet.warp_cut import (
     four,
     idle,
     lift_back,
+    off_box,
     row,
     smooth,
 )
@@ -34,6 +35,8 @@ _WALL_PENALTY, _STIFF = wp.constant(WALL_PENALTY), wp.constant(600.0)
 """Energy of charge that is out of reach [1/m]; with losses at most the second number [m] over the
 square of a large cluster's extent: more of it would hide what is in reach, see ``warp_cut.weigh``.
 """
+_OF_ITSELF = wp.constant(0.9)
+"""Clusters at a wall meet their images at most so much, over how they meet themselves."""
 _NEAR_LEAST, _FAR_LEAST = wp.constant(LEAST[0]), wp.constant(LEAST[-1])
 
 
@@ -220,6 +223,37 @@ def pairs(green: Response, cut: WarpActiveTree, out: wp.array3d(dtype=wp.float32
             value += barrier * x * x * x
     out[i, j, v] = value
     out[j, i, v] = value
+
+
+@wp.kernel
+def bound_walls(
+    green: Response, cut: WarpActiveTree, rows: wp.array3d(dtype=wp.float32),
+    pairs: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Let no cluster that is nearer to a wall than to the design meet its images more than itself.
+
+    Points of large ones may lie among the sources that stand for the wall; no definite matrix would
+    be left. They come to be out of reach instead, as those beyond the wall are.
+    """
+    i, v = wp.tid()
+    if cut.node[i, v] < 0 or cut.walled[v] == 0:
+        return
+    center = 0.5 * (cut.points[i, v][0] + cut.points[i, v][3])
+    low = center - green.room0
+    high = green.room1 - center
+    room = wp.min(wp.min(wp.min(low[0], low[1]), low[2]), wp.min(wp.min(high[0], high[1]), high[2]))
+    away = wp.length(off_box(center, green.box0, green.box1))
+    if room > wp.min(away, cut.extent[i, v]):
+        return
+    met = float(0.0)
+    for k in range(green.first, cut.width[v]):
+        met += rows[i, k, v] * rows[i, k, v]
+    most = _OF_ITSELF * wp.max(pairs[i, i, v], 0.0)
+    if met > most:
+        less = wp.sqrt(most / met)
+        for k in range(cut.width[v]):
+            rows[i, k, v] = less * rows[i, k, v]
+        cut.outside_fraction[i, v] = 1.0 - less * (1.0 - cut.outside_fraction[i, v])
 
 
 @wp.kernel

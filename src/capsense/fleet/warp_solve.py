@@ -48,11 +48,11 @@ def to_functions(cut: WarpActiveTree, limited: int, values: wp.array3d(dtype=wp.
 def own(shapes: Shapes, places: Places, e: int, b: int, x: int, y: int):
     """Energy of two functions of a body, complex."""
     u = places.choice[e, b]
-    place = shapes.block[u] + wp.int64(x * shapes.functions[u] + y)
-    out = wp.vec2(shapes.potential_coefficients[place], 0.0)
+    place = wp.int64(x) * wp.int64(shapes.functions[u]) + wp.int64(y)
+    out = wp.vec2(shapes.potential_coefficients[shapes.block[u] + place], 0.0)
     inside = places.inverse_susceptibility[e, b]
     if inside[0] != 0.0 or inside[1] != 0.0:
-        out += inside * shapes.neumann_to_dirichlet[place]
+        out += inside * shapes.neumann_to_dirichlet[shapes.inside[u] + place]
     return out / places.scale[e, b]
 
 

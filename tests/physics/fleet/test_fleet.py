@@ -194,8 +194,8 @@ def test_refused(fleet):
             Fleet("six_patch", BODIES, 1, excitation_frequency=wrong)
         with pytest.raises(ValueError, match=r"excitation_frequency is .*; give a positive number"):
             cs.Simulator("six_patch", excitation_frequency=wrong)
-    with pytest.raises(SceneError, match=r"environments is .*; give .* such as np.flatnonzero"):
-        fleet.change(0, BODIES[0], np.ones(COUNT, bool))
+    with pytest.raises(SceneError, match=r"environments is .*; give .* or a mask of 12"):
+        fleet.change(0, BODIES[0], np.ones(COUNT + 1, bool))
     with pytest.raises(SceneError, match=r"join: places is 0; give a list of numbers, such as"):
         fleet.join(0)
     with pytest.raises(SceneError, match=r"hide: places is 1; give a list of numbers"):

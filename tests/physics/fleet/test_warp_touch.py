@@ -130,7 +130,9 @@ def test_readings_below_a_fabric(fabric_design: cs.Design) -> None:
     assert touch_misses(fleet.step(poses, sensors).touch, truth) < 1e-3
 
 
-def test_forces_that_are_wrong_are_refused(foam_field: cs.Design) -> None:
+def test_forces_that_are_wrong_are_refused(
+    foam_field: cs.Design, monkeypatch: pytest.MonkeyPatch
+) -> None:
     body = cs.Body(cs.Sphere(0.01), cs.Pose((0, 0, 0.0115)))
     fleet = Fleet(foam_field, [body], 2, device="warp:cpu", budget=32)
     where = np.tile([0, 0, 0.0115, 0, 0, 0, 1.0], (2, 1, 1))
@@ -143,6 +145,7 @@ def test_forces_that_are_wrong_are_refused(foam_field: cs.Design) -> None:
             fleet.step(where, forces=forces)
     with pytest.raises(SceneError, match="Jacobian"):
         fleet.step(where, forces=[[0.5], [0.5]], jacobian=True)
+    monkeypatch.undo()  # else it gets the field of the other design
     bare = Fleet("six_patch", [body], 2, device="warp:cpu", budget=32)
     for forces in ([[0.5], [0.5]], wp.zeros((2, 1), dtype=wp.float32, device="cpu")):
         with pytest.raises(SceneError, match="cover"):
