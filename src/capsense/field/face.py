@@ -144,11 +144,11 @@ class FacePlane(NamedTuple):
         )  # fmt: skip
 
 
-def plane_panels(solution: BoundarySolution, reach: float, finest: float = 0.0) -> FacePlane:
+def plane_panels(solution: BoundarySolution, reach: float) -> FacePlane:
     """Panels of a plane that follow the outlines of the sheets behind it.
 
-    Above the electrodes they are the electrodes' own, so that no panel lies across a rim, unless
-    those are smaller than ``finest`` [m]. ``reach`` is how far it goes beyond the electrodes [m].
+    Above the electrodes they are the electrodes' own, so that no panel lies across a rim.
+    ``reach`` is how far it goes beyond the electrodes [m].
     """
     design = solution.design
     film = design.film
@@ -172,11 +172,6 @@ def plane_panels(solution: BoundarySolution, reach: float, finest: float = 0.0) 
         if piece.geom_type != "Polygon" or piece.area <= 1e-6 * reach**2:
             return
         facet = Facet(piece, np.zeros(3), np.eye(3))
-        smallest = max(grading.smallest, finest)
-        grading = replace(
-            grading, edge=max(grading.edge, finest / grading.aspect), smallest=smallest,
-            largest=max(grading.largest, 1.01 * smallest),
-        )  # fmt: skip
         pieces = cut_facet(facet, rims, grading)
         if pieces:
             parts.append(make_panels(facet, pieces))

@@ -65,8 +65,6 @@ _CELL = 0.6
 """Size of the cells of the table, over the validity distance."""
 _CELLS = 16_000
 """At most about so many cells."""
-_FLAT = 0.6
-"""Smallest panels of a plane, over its distance: what it sees varies over that."""
 _PART = 500
 """So many panels at a time have their potentials averaged."""
 _LEAST = 0.003
@@ -84,9 +82,7 @@ class GroundedPlane(NamedTuple):
     grounded: Array
     """… and with it at ground, (m, m): 4π eps0 = 1."""
     potential: Array
-    """Their mean potentials with each terminal at 1 V, (m, t) …"""
-    charges: Array
-    """… and the charges that hold them at these, with the design at ground, (m, t)."""
+    """Their mean potentials with each terminal at 1 V, (m, t)."""
 
 
 class PlaneResponse:
@@ -132,11 +128,7 @@ class PlaneResponse:
                 + kernels.normal_gradient_block(self._rows, model.floor, both, n) @ on_plane
             )
             out[self._rows] -= jump * gradient / (4 * math.pi)
-        areas = plane.areas
-        return GroundedPlane(
-            out, own / areas, grounded / areas, -sides[:, :-1] / UNIT,
-            -on_plane[:, :-1] * areas[:, None] / UNIT,
-        )  # fmt: skip
+        return GroundedPlane(out, own / plane.areas, grounded / plane.areas, -sides[:, :-1] / UNIT)
 
 
 def table_solution(solution: BoundarySolution, panel_scale: float) -> BoundarySolution:
@@ -194,17 +186,17 @@ def build_gap_table(
     """
     model = solution.model
     design, heights = solution.design, np.asarray(unit * _HEIGHTS, float)
-    top = top_of(design)
+    plane, top = plane_panels(solution, _MARGIN * unit), top_of(design)
+    plates = plates_of(plane.panels, design)
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
     response, errors = PlaneResponse(solution), np.full(len(heights), np.inf)
     for k, height in enumerate(heights):
         progress(f"response to a plane: {k + 1} of {len(heights)}")
-        plane = plane_panels(solution, _MARGIN * unit, _FLAT * height)
         panels = plane.at(top + height)
         found = response.at(panels, densities)
         changes[k] = found.change[: model.sheet_panels]
         if green is not None and height >= _SOUGHT * unit:
-            errors[k] = energy_error(found, panels, plates_of(plane.panels, design), green)
+            errors[k] = energy_error(found, panels, plates, green)
         del found
     validity = unit if green is None else valid_from(heights, errors)
     return _cells_of(solution, changes, heights, top, validity, plane.panels)
@@ -240,11 +232,13 @@ def energy_error(
     for some, columns in plates:
         if len(some):
             phi, exact = potential[some, columns], found.potential[some, columns]
-            if len(some) == plane.size:
-                one, two = scipy.linalg.cho_solve(factor, phi), found.charges[:, columns]
-            else:
-                part = np.ix_(some, some)
-                one, two = _solved(compact[part], phi), _solved(grounded[part], exact)
+            part = np.ix_(some, some)
+            one = (
+                scipy.linalg.cho_solve(factor, phi)
+                if len(some) == plane.size
+                else _solved(compact[part], phi)
+            )
+            two = _solved(grounded[part], exact)
             worst = max(worst, float(np.abs((phi * one).sum(0) / (exact * two).sum(0) - 1).max()))
     return worst
 
