@@ -13,6 +13,9 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from capsense.errors import CapSenseError
 
 MAX_LENGTH = 10.0
@@ -380,6 +383,33 @@ class Table:
         if not isinstance(value, list) or len(value) not in count:
             raise self.error(f"{key} = {shorten(value)} must be {what}")
         return tuple(self._finite(key, v) for v in value)
+
+
+def chosen_rows(environments: object, count: int, error: type[CapSenseError]) -> NDArray[np.int64]:
+    """Numbers of environments, in the order given, shape (k,).
+
+    Args:
+        environments: Numbers, a mask of shape (e,), or None for all.
+        count: How many there are, e.
+        error: Raised where there is no such environment, or the mask is of another length.
+    """
+    if environments is None:
+        return np.arange(count)
+    try:
+        rows = np.asarray(environments)
+    except (TypeError, ValueError, RuntimeError):
+        rows = np.array(None)
+    if rows.dtype == np.bool_ and rows.shape == (count,):
+        return np.flatnonzero(rows)
+    rows = rows.ravel()
+    if not rows.size:
+        return np.zeros(0, np.int64)
+    if rows.dtype.kind not in "iu" or rows.min() < 0 or rows.max() >= count:
+        raise error(
+            f"environments is {shorten(environments)}; give numbers from 0 to {count - 1}, or a "
+            f"mask of {count}"
+        )
+    return rows.astype(np.int64)
 
 
 def shorten(value: Any) -> str:

@@ -14,6 +14,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._style import signal_colours, strength
+from capsense._validate import chosen_rows
 from capsense.adapters.grounds import Ground, TerrainParts
 from capsense.adapters.meshes import Terrain
 from capsense.adapters.record import ParallelData, Record
@@ -22,7 +23,7 @@ from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed
 from capsense.fleet import Fleet
-from capsense.fleet.bodies import chosen_rows, on_device
+from capsense.fleet.bodies import on_device
 from capsense.reading import FleetReading
 from capsense.readout import Readout
 from capsense.readout.randomisation import ReadoutRandomisation
@@ -259,7 +260,7 @@ class ParallelSensors:
         Raises:
             SceneError: There is no such world.
         """
-        rows = chosen_rows(environments, self.fleet.count)
+        rows = chosen_rows(environments, self.fleet.count, SceneError)
         if self._segments is None:
             rims = [e.surface.rims for e in self.design.electrodes]
             owner = np.repeat(np.arange(len(rims)), [len(r) for r in rims])
@@ -322,7 +323,7 @@ class ParallelSensors:
         return self._mask_of_numbers(environments)
 
     def _mask_of_numbers(self, environments: Any) -> Any:
-        rows = chosen_rows(environments, self.fleet.count)
+        rows = chosen_rows(environments, self.fleet.count, SceneError)
         chosen = np.isin(np.arange(self.fleet.count), rows)
         return wp.array(chosen, dtype=wp.bool, device=self._poses.device)
 

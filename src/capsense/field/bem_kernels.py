@@ -226,7 +226,7 @@ def _is_far(p, j, x, y, z, diameter):
     """Whether panel j is met by moments from a point, or from the middle of another panel."""
     dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], z - p.centers[j, 2]
     own = p.diameters[j]
-    reach = max(_FAR * own, _OUTER * (own + diameter) if diameter > 0.0 else 0.0)
+    reach = max(_FAR * own, _OUTER * (own + diameter))
     return dx * dx + dy * dy + dz * dz >= reach * reach
 
 
@@ -306,9 +306,7 @@ def _mean_potential(p, i, j, floor):
     x, y, z = p.centers[i, 0], p.centers[i, 1], p.centers[i, 2]
     dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], z - p.centers[j, 2]
     reach = _OUTER * (p.diameters[j] + p.diameters[i])
-    across = dx * dx + dy * dy
-    near = across + dz * dz < reach * reach
-    if not near and not (p.diameters[i] > z - floor and across < reach * reach):
+    if dx * dx + dy * dy + dz * dz >= reach * reach and not _over_floor(p, i, j, floor):
         return _imaged_potential(p, j, floor, x, y, z)
     area = p.weights[i].sum()
     value = 0.0

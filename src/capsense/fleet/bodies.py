@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._validate import as_whole, shorten
+from capsense._validate import as_whole, chosen_rows, shorten
 from capsense.errors import SceneError
 from capsense.scene import Body, Layers, Shape, SurfaceMesh
 from capsense.solver.bodies.outline import write_outline
@@ -140,7 +140,7 @@ class BodyTable:
         whole = as_whole(place)
         if whole is None or not 0 <= whole < self.places:
             raise SceneError(f"place is {place!r}; there are places 0 to {self.places - 1}")
-        rows = chosen_rows(environments, self.count)
+        rows = chosen_rows(environments, self.count, SceneError)
         if not rows.size:
             return
         each: list[Body | None]
@@ -281,32 +281,6 @@ def require_no_gradient(what: str, values: Any) -> None:
             f"{what} is a tensor that requires gradients, which step does not follow; give "
             f"{what}.detach(), or write capsense.fleet.autograd.change(fleet, poses)"
         )
-
-
-def chosen_rows(environments: ArrayLike | None, count: int) -> NDArray[np.int64]:
-    """Numbers of environments, in the order given, shape (k,).
-
-    Args:
-        environments: Numbers, a mask of shape (e,), or None for all.
-        count: How many there are, e.
-
-    Raises:
-        SceneError: There is no such environment, or the mask is of another length.
-    """
-    if environments is None:
-        return np.arange(count)
-    rows = np.asarray(environments)
-    if rows.dtype == np.bool_ and rows.shape == (count,):
-        return np.flatnonzero(rows)
-    rows = rows.ravel()
-    if not rows.size:
-        return np.zeros(0, np.int64)
-    if rows.dtype.kind not in "iu" or rows.min() < 0 or rows.max() >= count:
-        raise SceneError(
-            f"environments is {shorten(environments)}; give numbers from 0 to {count - 1}, or a "
-            f"mask of {count}"
-        )
-    return rows.astype(np.int64)
 
 
 def checked_forces(forces: ArrayLike, shape: tuple[int, int]) -> Array:

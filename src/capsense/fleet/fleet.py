@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._thread_pool import ForkSafeRLock
-from capsense._validate import as_whole, checked_frequency, shorten
+from capsense._validate import as_whole, checked_frequency, chosen_rows, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
@@ -26,7 +26,6 @@ from capsense.fleet.bodies import (
     BodyTable,
     checked_forces,
     checked_poses,
-    chosen_rows,
     host_array,
     on_device,
     require_no_gradient,
@@ -36,7 +35,6 @@ from capsense.fleet.chips import ChipsOfSensors
 from capsense.fleet.cpu import CpuCore
 from capsense.reading import FleetReading, FleetTouch, Reading, StepStats
 from capsense.readout import Readout
-from capsense.readout.checks import chosen
 from capsense.readout.config import make_readout
 from capsense.readout.randomisation import ReadoutRandomisation
 from capsense.readout.side_by_side import SideBySide
@@ -364,7 +362,7 @@ class Fleet:
             ReadoutError: There is no such environment, the seed is no whole number from 0 on, or a
                 time is not finite.
         """
-        rows = chosen(host_array(environments), self.count)
+        rows = np.unique(chosen_rows(host_array(environments), self.count, ReadoutError))
         if self._chips is not None:
             with self._one:
                 self._chips.reset(rows, start=start, seed=seed)
@@ -432,7 +430,7 @@ class Fleet:
             if self._warp is not None:
                 return self._warp.mask(environments)
             environments = host_array(environments)
-        return np.isin(np.arange(self.count), chosen_rows(environments, self.count))
+        return np.isin(np.arange(self.count), chosen_rows(environments, self.count, SceneError))
 
     def _forces(self, forces: ArrayLike | None, jacobian: bool) -> Any:
         """Forces on the bodies [N], shape (e, b); those on a device of Warp are not looked at.

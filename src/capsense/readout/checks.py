@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._validate import as_number, shorten
+from capsense._validate import as_number
 from capsense.errors import ReadoutError
 
 Array = NDArray[np.float64]
@@ -109,28 +109,3 @@ def spread(owner: str, name: str, value: object, shape: tuple[int, ...]) -> Arra
         shown = repr(value) if array.ndim < 2 else f"of shape {array.shape}"
         raise ReadoutError(f"{owner}: {name} is {shown}; give a number, or {wanted}")
     return np.broadcast_to(array, shape).copy()
-
-
-def chosen(environments: object, count: int) -> Ints:
-    """Numbers of environments, rising, shape (r,): of numbers, of a mask, or of None for all.
-
-    Raises:
-        ReadoutError: There is no such environment, or the mask is of another length.
-    """
-    if environments is None:
-        return np.arange(count)
-    try:
-        given = np.asarray(environments)
-    except (TypeError, ValueError, RuntimeError):
-        given = np.array(None)
-    if given.dtype == bool and given.shape == (count,):
-        return np.flatnonzero(given)
-    if not given.size:
-        return np.zeros(0, np.int64)
-    whole = given.dtype.kind in "iu"
-    if not whole or (given < 0).any() or (given >= count).any():
-        raise ReadoutError(
-            f"environments is {shorten(environments)}; give numbers from 0 to {count - 1}, or a "
-            f"mask of {count}"
-        )
-    return np.unique(given).astype(np.int64)

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._validate import chosen_rows
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor, ResponseCurve
-from capsense.readout.checks import Array, Ints, chosen, finite, require_whole
+from capsense.readout.checks import Array, Ints, finite, require_whole
 from capsense.readout.conversions import Held
 from capsense.readout.converter import Conversion
 from capsense.readout.noise import (
@@ -107,7 +108,7 @@ class ManyChips:
         Raises:
             ReadoutError: There is no such environment, or a number is out of range.
         """
-        rows = chosen(environments, self.shape[0])
+        rows = np.unique(chosen_rows(environments, self.shape[0], ReadoutError))
         if len(rows):
             self._begin(rows, 0.0 if start is None else start, seed)
 
