@@ -33,9 +33,9 @@ class Body:
             same robot; or :class:`~capsense.scene.materials.Ties` to both. It matters for
             conductors only.
         name: Optional; unique within a scene.
-        conductor: Optional; bodies of one name are one conductor, whether they touch or not, such as
-            the limbs of a person. Their grounding is that of the whole conductor, and must be the
-            same. It matters for conductors only.
+        conductor: Optional; bodies of one name are one conductor, such as the limbs of a person,
+            whether they touch or not. Their grounding is that of the whole conductor, and must be
+            the same. It matters for conductors only.
         force: Normal force that presses it onto the cover of a design [N], such as the contact
             force of a simulator; it then decides how deep the body lies in the cover, whatever the
             height of its pose. By default the overlap with the cover does.
