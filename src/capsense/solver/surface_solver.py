@@ -32,6 +32,7 @@ from capsense.solver.gap.touch import CoverContact, Pressed
 from capsense.solver.gap.touch_kernels import no_foundation
 from capsense.solver.packing import BodyTemplate, PackedBodies, View, make_template, same
 from capsense.solver.system.lossy import solve_lossy
+from capsense.solver.system.network_kernels import tie_what_is_outside
 from capsense.solver.system.step import (
     DIFFERENCE,
     Solution,
@@ -352,9 +353,21 @@ class SurfaceSolver:
     def look(self, scene: Scene) -> View:
         """Find the bodies of a scene that reach into the domain."""
         packed = scene.pack()
-        met = overlapping(packed.bounds, *(self.length * self._sight))
+        met = self._with_conductors(scene, overlapping(packed.bounds, *(self.length * self._sight)))
         matter = self.matter_of(list(scene)).repeated(met.tolist())
         return View(scene, packed, met, matter)
+
+    @staticmethod
+    def _with_conductors(scene: Scene, met: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Bodies that are met, and what else there is of conductors that are not at ground."""
+        names = {scene[k].conductor for k in met.tolist()} - {None}
+        if not names:
+            return met
+        more = [
+            k for k, body in enumerate(scene)
+            if body.conductor in names and body.grounding != "grounded"
+        ]  # fmt: skip
+        return np.union1d(met, np.array(more, met.dtype))
 
     def matter_of(self, bodies: Sequence[Body]) -> Matter:
         """What bodies are made of, with lengths as kernels take them."""
@@ -385,9 +398,12 @@ class SurfaceSolver:
             return bodies, None
         matter = bodies.matter
         if matter.lossy:
+            ties = matter.ties(sizes_of(bodies.records, bodies.shapes))
+            free = (bodies.records["free"] != 0) & (bodies.records["neutral"] == 0)
+            ties = np.where(free, bodies.records["ground_elastance"], ties)
             out = solve_lossy(
-                bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)),
-                matter.inverse_susceptibility, self.green, preset.threshold, preset.width,
+                bodies.records, ties, matter.inverse_susceptibility, self.green,
+                preset.threshold, preset.width,
             )  # fmt: skip
         else:
             out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
@@ -478,6 +494,7 @@ class SurfaceSolver:
         for i, at in offsets:
             shift[i] = rotation[i] @ at
             records["position"][i] += shift[i]
+        tie_what_is_outside(records, self.green.space)
         out = PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
         if not laid.rigid:
             out.find_near(self.green)

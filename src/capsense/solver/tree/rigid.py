@@ -67,6 +67,7 @@ BODY = np.dtype(
         ("sizes", np.float64, 3),  # of a primitive, as its ``params``
         ("triangles", np.int64), ("boxes", np.int64),  # of a mesh: addresses of its tree
         ("triangle_count", np.int64), ("levels", np.int64),
+        ("capacitance", np.float64),  # of the shape in free space [m]
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("sunk", np.float64),  # how far below that it stands in a cover [m], once it is pressed out
@@ -151,6 +152,7 @@ class RigidShape(Frozen):
         record = np.zeros(1, BODY)[0]
         record["n"] = record["n_tabulated"] = len(self.panels)
         record["n_panel_clusters"] = 2 * len(self.panels) - 1
+        record["capacitance"] = self.capacitance
         record["potential_coefficients"], record["own"] = (
             self.potential_coefficients.ctypes.data,
             self.own.ctypes.data,
