@@ -1,13 +1,15 @@
-"""Chains of rigid segments with hinges: what limbs are made of."""
+"""Trees of rigid segments with hinges: what people are made of."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from capsense.errors import SceneError
 from capsense.scene import Capsule, Pose
 from capsense.scene.pose import Vec3
 
@@ -52,25 +54,46 @@ class Joint:
 
 @dataclass(frozen=True)
 class Segment:
-    """A rigid segment; it hangs on the one before it."""
+    """A rigid segment; it hangs on its parent."""
 
     name: str
     origin: Vec3
-    """Its joint centre [m] in the frame of the segment before, or of the limb."""
+    """Its joint centre [m] in the frame of its parent."""
     joints: tuple[Joint, ...]
     """Its joints; the first turns all the others."""
     parts: tuple[LimbPart, ...]
     mass: float
     """Mass [kg]."""
+    parent: str | None = None
+    """Name of the segment that it hangs on; None for the limb's frame."""
+
+    @property
+    def volume(self) -> float:
+        """Sum of the volumes of the parts [m³]; where they overlap, they count twice."""
+        return sum(p.shape.volume for p in self.parts)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Segments, each of which hangs on the one before it."""
+    """A tree of segments: each hangs on its parent, which comes before it.
+
+    Raises:
+        SceneError: A parent is not there, or comes later.
+    """
 
     name: str
     """Prefix of the names of its bodies, ``"right_arm"`` say."""
     segments: tuple[Segment, ...]
+
+    def __post_init__(self) -> None:
+        known: set[str | None] = {None}
+        for segment in self.segments:
+            if segment.parent not in known:
+                raise SceneError(
+                    f"{self.name}: {segment.name} hangs on {segment.parent!r}, which is no segment "
+                    "before it; give parents first"
+                )
+            known.add(segment.name)
 
     @property
     def joints(self) -> tuple[Joint, ...]:
@@ -80,3 +103,10 @@ class Chain:
     def named_parts(self, segment: Segment) -> list[tuple[str, LimbPart]]:
         """The parts of a segment with the names of their bodies."""
         return [(f"{self.name}_{segment.name}_{k}", p) for k, p in enumerate(segment.parts, 1)]
+
+
+def scaled_masses(segments: Iterable[Segment], mass: float) -> tuple[Segment, ...]:
+    """Segments of a mass [kg] together, shared out by their volumes."""
+    found = tuple(segments)
+    volume = sum(s.volume for s in found)
+    return tuple(replace(s, mass=mass * s.volume / volume) for s in found)

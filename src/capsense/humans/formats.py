@@ -191,9 +191,15 @@ def to_urdf(limb: Chain) -> str:
     """
     root = Element("robot", name=limb.name)
     _urdf_link(root, limb.name, None)
-    above = limb.name
     for segment in limb.segments:
         name = f"{limb.name}_{segment.name}"
+        above = limb.name if segment.parent is None else f"{limb.name}_{segment.parent}"
+        if not segment.joints:
+            _urdf_link(root, name, segment)
+            fixed = SubElement(root, "joint", name=f"{name}_fixed", type="fixed")
+            SubElement(fixed, "origin", xyz=_numbers(segment.origin), rpy="0 0 0")
+            SubElement(fixed, "parent", link=above)
+            SubElement(fixed, "child", link=name)
         for k, joint in enumerate(segment.joints):
             last = k == len(segment.joints) - 1
             link = name if last else f"{limb.name}_{joint.name}"
@@ -215,11 +221,12 @@ def to_urdf(limb: Chain) -> str:
 def _mjcf_element(limb: Chain, pose: Pose, damping: float) -> Element:
     x, y, z, w = pose.quaternion
     base = Element("body", name=limb.name, pos=_numbers(pose.position), quat=_numbers((w, x, y, z)))
-    above = base
+    bodies: dict[str | None, Element] = {None: base}
     for segment in limb.segments:
-        above = SubElement(
-            above, "body", name=f"{limb.name}_{segment.name}", pos=_numbers(segment.origin)
-        )
+        above = bodies[segment.name] = SubElement(
+            bodies[segment.parent], "body",
+            name=f"{limb.name}_{segment.name}", pos=_numbers(segment.origin),
+        )  # fmt: skip
         for joint in segment.joints:
             bounds = [math.degrees(joint.lower), math.degrees(joint.upper)]
             SubElement(
@@ -227,12 +234,11 @@ def _mjcf_element(limb: Chain, pose: Pose, damping: float) -> Element:
                 axis=_numbers(joint.axis), range=_numbers(bounds), limited="true",
                 damping=_number(damping),
             )  # fmt: skip
-        volume = sum(p.shape.volume for p in segment.parts)
         for name, part in limb.named_parts(segment):
             SubElement(
                 above, "geom", name=name, type="capsule", size=_number(part.radius),
                 fromto=_numbers((*part.start, *part.end)),
-                mass=_number(segment.mass * part.shape.volume / volume),
+                mass=_number(segment.mass * part.shape.volume / segment.volume),
             )  # fmt: skip
     return base
 
