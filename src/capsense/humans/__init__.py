@@ -4,6 +4,7 @@
 - :mod:`~capsense.humans.limb`: arms, legs and hands
 - :mod:`~capsense.humans.fingers`: bones and joints of the hand
 - :mod:`~capsense.humans.people`: whole people, their postures
+- :mod:`~capsense.humans.ground`: their capacitance to ground
 - :mod:`~capsense.humans.chain`: trees of capsules with joints
 - :mod:`~capsense.humans.formats`: these as MJCF and URDF; meshes of the SMPL family
 """
@@ -11,6 +12,7 @@
 from capsense.humans.build import Build
 from capsense.humans.chain import Joint, LimbPart, Segment
 from capsense.humans.formats import load_smplx
+from capsense.humans.ground import capacitance_to_ground
 from capsense.humans.limb import Limb, arm, hand, leg
 from capsense.humans.people import ON_BACK, POSTURES, person
 
@@ -23,6 +25,7 @@ __all__ = [
     "LimbPart",
     "Segment",
     "arm",
+    "capacitance_to_ground",
     "hand",
     "leg",
     "load_smplx",

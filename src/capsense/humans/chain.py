@@ -121,9 +121,10 @@ class Chain:
         for segment in self.segments:
             here = poses[segment.parent] @ Pose(segment.origin)
             for joint in segment.joints:
-                half = 0.5 * checked.get(joint.name, 0.0)
-                x, y, z = (math.sin(half) * a for a in joint.axis)
-                here = here @ Pose((0, 0, 0), (x, y, z, math.cos(half)))
+                angle = checked.get(joint.name)
+                if angle:
+                    x, y, z = (math.sin(0.5 * angle) * a for a in joint.axis)
+                    here = here @ Pose((0, 0, 0), (x, y, z, math.cos(0.5 * angle)))
             poses[segment.name] = here
         return {name: pose for name, pose in poses.items() if name is not None}
 

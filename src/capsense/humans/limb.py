@@ -58,9 +58,9 @@ class Limb(Chain):
         tie = checked_grounding(grounding)
         if not isinstance(tie, str):
             tie /= sum(len(s.parts) for s in self.segments)
-        where = self.forward(angles, degrees=degrees)
+        where = {n: pose @ at for n, at in self.forward(angles, degrees=degrees).items()}
         return [
-            Body(part.shape, pose @ where[segment.name] @ part.pose, material, tie, name)
+            Body(part.shape, where[segment.name] @ part.pose, material, tie, name)
             for segment in self.segments
             for name, part in self.named_parts(segment)
         ]
