@@ -41,6 +41,7 @@ def person(
     build: Build = Build(),  # noqa: B008, a build is immutable
     *,
     hands: Hands = "simple",
+    name: str = "person",
 ) -> Limb:
     """A whole person; the frame stands midway between the hip centres.
 
@@ -55,6 +56,7 @@ def person(
         build: Size of the person.
         hands: ``"simple"``, five capsules each, or ``"detailed"``, with all finger joints, as
             :func:`~capsense.humans.hand` makes them.
+        name: Prefix of the names of bodies; it tells people apart who share a scene.
 
     Raises:
         SceneError: Other hands.
@@ -69,7 +71,7 @@ def person(
     for side, y in zip(SIDES, (1.0, -1.0), strict=True):
         place = (0.0, 0.5 * y * build.hip_spacing, 0.0)
         segments += _hung(leg_segments(build, side), side, "pelvis", place)
-    return Limb("person", tuple(segments), POSTURES["standing"])
+    return Limb(name, tuple(segments), POSTURES["standing"])
 
 
 def _hung(

@@ -104,6 +104,8 @@ def test_limbs_of_a_person_are_those_alone() -> None:
     assert whole["left_upper_arm"].parent == "chest"
     assert whole["right_thigh"].parent == "pelvis"
     assert whole["left_thigh"].origin[1] == approx(0.5 * build.hip_spacing)
+    both = [b for name in ("anna", "ben") for b in person(build, name=name).bodies()]
+    assert cs.Scene(both)["anna_left_foot_1"].shape == cs.Scene(both)["ben_left_foot_1"].shape
     with pytest.raises(SceneError, match="hand is 'none'; choose"):
         person(hands="none")  # type: ignore[arg-type]
 
