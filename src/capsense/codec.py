@@ -177,6 +177,7 @@ def body_fields(body: Body) -> Fields:
         "dispersion": np.array(terms, dtype=float),
         "grounding": "capacitance" if tied else grounding,
         "farads": body.grounding if tied else 0.0,
+        "conductor": body.conductor or "",
     }
 
 
@@ -199,7 +200,11 @@ def read_body(message: Any, shapes: Mapping[int, Shape]) -> Body:
         grounding = message.farads if tied else message.grounding
         if not tied and grounding.startswith("ties "):
             grounding = Ties(*map(float, grounding.split()[1:]))
-        return Body(shapes[message.shape], Pose(), matter, grounding, message.name or None)
+        conductor = getattr(message, "conductor", "") or None  # earlier recordings have none
+        return Body(
+            shapes[message.shape], Pose(), matter, grounding, message.name or None,
+            conductor=conductor,
+        )  # fmt: skip
     except (SceneError, TypeError, ValueError) as error:
         raise RecordingError(f"body {message.id} is damaged: {error}") from None
 

@@ -145,7 +145,11 @@ class World:
             shape = solid.shape if isinstance(solid.shape, Shape) else plate
             count = taken[solid.label] = taken.get(solid.label, 0) + 1
             label = solid.label if count == 1 else f"{solid.label}#{count}"
-            self._bodies.append(Body(shape, Pose(), solid.material, solid.tie.grounding, label))
+            tie = solid.tie
+            conductor = None if isinstance(tie.grounding, str) else tie.owner
+            self._bodies.append(
+                Body(shape, Pose(), solid.material, tie.grounding, label, conductor=conductor)
+            )
         owners = list(dict.fromkeys(s.tie.owner for s in self.solids))
         self._sharing = np.array(
             [
@@ -255,7 +259,7 @@ class World:
             b = self._bodies[index]
             assert not isinstance(b.grounding, str)
             grounding = b.grounding / count
-            self._tied[key] = Body(b.shape, b.pose, b.material, grounding, b.name, b.force)
+            self._tied[key] = replace(b, grounding=grounding)
         return self._tied[key]
 
 
