@@ -134,8 +134,6 @@ class Matter:
             if body.conductor is not None and self.conducting[k]:
                 group[k] = named.setdefault(body.conductor, k)
         close &= group[:, None] != group
-        if not close.any():
-            return _grouped(self, tuple(group.tolist()))
         first, second = np.nonzero(np.triu(close, 1))
         apart = parted(
             chosen[np.stack([first, second], axis=1)],
