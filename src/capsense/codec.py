@@ -177,7 +177,6 @@ def body_fields(body: Body) -> Fields:
         "dispersion": np.array(terms, dtype=float),
         "grounding": "capacitance" if tied else grounding,
         "farads": body.grounding if tied else 0.0,
-        "conductor": body.conductor or "",
     }
 
 
@@ -200,11 +199,7 @@ def read_body(message: Any, shapes: Mapping[int, Shape]) -> Body:
         grounding = message.farads if tied else message.grounding
         if not tied and grounding.startswith("ties "):
             grounding = Ties(*map(float, grounding.split()[1:]))
-        conductor = getattr(message, "conductor", "") or None  # earlier recordings have none
-        return Body(
-            shapes[message.shape], Pose(), matter, grounding, message.name or None,
-            conductor=conductor,
-        )  # fmt: skip
+        return Body(shapes[message.shape], Pose(), matter, grounding, message.name or None)
     except (SceneError, TypeError, ValueError) as error:
         raise RecordingError(f"body {message.id} is damaged: {error}") from None
 

@@ -107,28 +107,6 @@ def test_what_touches_outside_of_the_domain_counts(simulators, jacobian):
     assert np.abs(apart.delta - alone.delta).max() > 0.05 * np.abs(alone.delta).max()
 
 
-@pytest.mark.parametrize("grounding", [2e-12, "floating"])
-def test_one_name_is_one_conductor(simulators, grounding):
-    """Invariant: two arms of one name read as two that a bar outside of the domain joins."""
-    sim = simulators("six_patch_bare")
-    assert sim.design.domain.upper[0] < 0.29
-    along, across = (0.0, 2**-0.5, 0.0, 2**-0.5), (2**-0.5, 0.0, 0.0, 2**-0.5)
-
-    def arms(**options: object) -> list[cs.Body]:
-        poses = [cs.Pose((0.2, y, 0.06), along) for y in (-0.06, 0.06)]
-        return [cs.Body(cs.Capsule(0.02, 0.4), p, grounding=grounding, **options) for p in poses]
-
-    tie = grounding if grounding == "floating" else 4e-12
-    bar = cs.Body(cs.Capsule(0.02, 0.12), cs.Pose((0.4, 0.0, 0.06), across), grounding=tie)
-    joined = sim.step(cs.Scene([*arms(), bar])).delta
-    named = arms(conductor="robot")
-    if grounding != "floating":  # the bar's tie comes along
-        named = [cs.Body(b.shape, b.pose, grounding=4e-12, conductor="robot") for b in named]
-    np.testing.assert_allclose(sim.step(cs.Scene(named)).delta, joined, rtol=1e-9)
-    apart = sim.step(cs.Scene(arms())).delta
-    assert np.abs(apart - joined).max() > 0.02 * np.abs(joined).max()
-
-
 @pytest.mark.parametrize("seams", [10, pytest.param(30, marks=pytest.mark.e2e)])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_seam_is_hardly_seen(simulators, axis, seams):

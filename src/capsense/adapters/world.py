@@ -145,11 +145,7 @@ class World:
             shape = solid.shape if isinstance(solid.shape, Shape) else plate
             count = taken[solid.label] = taken.get(solid.label, 0) + 1
             label = solid.label if count == 1 else f"{solid.label}#{count}"
-            tie = solid.tie
-            conductor = None if isinstance(tie.grounding, str) else tie.owner
-            self._bodies.append(
-                Body(shape, Pose(), solid.material, tie.grounding, label, conductor=conductor)
-            )
+            self._bodies.append(Body(shape, Pose(), solid.material, solid.tie.grounding, label))
         owners = list(dict.fromkeys(s.tie.owner for s in self.solids))
         self._sharing = np.array(
             [
@@ -259,7 +255,7 @@ class World:
             b = self._bodies[index]
             assert not isinstance(b.grounding, str)
             grounding = b.grounding / count
-            self._tied[key] = replace(b, grounding=grounding)
+            self._tied[key] = Body(b.shape, b.pose, b.material, grounding, b.name, b.force)
         return self._tied[key]
 
 

@@ -50,7 +50,7 @@ class Limb(Chain):
             material: What it is made of.
             grounding: ``"grounded"``, ``"floating"``, or the capacitance [F] that ties the
                 whole person to ground, :func:`~capsense.humans.capacitance_to_ground` say. The
-                bodies share it; they are one conductor, of the limb's name.
+                bodies share it; as they touch, they are one conductor on all of it.
 
         Raises:
             SceneError: A joint, an angle, the material or the grounding is wrong.
@@ -61,14 +61,7 @@ class Limb(Chain):
             tie /= sum(len(s.parts) for s in self.segments)
         where = {n: pose @ at for n, at in self.forward(angles, degrees=degrees).items()}
         return [
-            Body(
-                part.shape,
-                where[segment.name] @ part.pose,
-                material,
-                tie,
-                name,
-                conductor=self.name,
-            )
+            Body(part.shape, where[segment.name] @ part.pose, material, tie, name)
             for segment in self.segments
             for name, part in self.named_parts(segment)
         ]

@@ -36,9 +36,6 @@ class Body:
         force: Normal force that presses it onto the cover of a design [N], such as the contact
             force of a simulator; it then decides how deep the body lies in the cover, whatever the
             height of its pose. By default the overlap with the cover does.
-        conductor: Optional name of the conductor that it is a part of. Conductors of one name are
-            one, whether they touch or not, on the sum of their ties to ground, also where parts lie
-            outside the domain. Conductors that touch are one anyway.
 
     Raises:
         SceneError: An argument is of the wrong kind or out of range.
@@ -50,7 +47,6 @@ class Body:
     grounding: Grounding
     name: str | None
     force: float | None
-    conductor: str | None
 
     def __init__(
         self,
@@ -60,7 +56,6 @@ class Body:
         grounding: Grounding = "grounded",
         name: str | None = None,
         force: float | None = None,
-        conductor: str | None = None,
     ) -> None:
         if not isinstance(shape, Shape):
             mesh = hasattr(shape, "vertices") and hasattr(shape, "faces")
@@ -72,8 +67,6 @@ class Body:
             raise SceneError(f"shape is {shape!r}; give a {fix}")
         if not (name is None or (isinstance(name, str) and name)):
             raise SceneError(f"body name is {name!r}; give a non-empty string or None")
-        if not (conductor is None or (isinstance(conductor, str) and conductor)):
-            raise SceneError(f"conductor is {conductor!r}; give a non-empty string or None")
         fields = self.__dict__
         fields["shape"] = shape
         fields["pose"] = checked_pose(pose)
@@ -81,7 +74,6 @@ class Body:
         fields["grounding"] = checked_grounding(grounding)
         fields["name"] = name
         fields["force"] = checked_force(force)
-        fields["conductor"] = conductor
 
     def pressed(self, force: float | None) -> Body:
         """Return the same body under a normal force [N]; the rest is shared.

@@ -334,9 +334,7 @@ def _alike(old: Scene, new: Scene) -> Scene:
 
     def known(body: Body) -> Body:
         b = before.get(body.name, body)
-        same = (b.shape, b.material, b.grounding, b.conductor) == (
-            body.shape, body.material, body.grounding, body.conductor
-        )  # fmt: skip
+        same = (b.shape, b.material, b.grounding) == (body.shape, body.material, body.grounding)
         return b.moved(body.pose).pressed(body.force) if same else body
 
     return Scene([known(body) for body in new])

@@ -78,35 +78,6 @@ def test_a_limb_reads_the_same(
     assert np.diag(readings[2]).min() > 1e-16
 
 
-def test_two_hands_are_one_conductor(simulators: Callable[..., cs.Simulator]) -> None:
-    """The trunk of a person on 20 pF is outside of the domain; as two conductors on 10 pF each, the
-    hands are off by 4 %."""
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
-    limb = person(hands="detailed")
-    bent = dict(POSTURES["standing"])
-    for side in ("left", "right"):
-        bent |= {f"{side}_elbow_flexion": 1.4, f"{side}_shoulder_rotation": 0.55}
-        bent |= {f"{side}_forearm_pronation": 1.3}
-    x, _, z = limb.forward(bent)["right_palm"].position
-    base = cs.Pose((-0.12 - x, 0.0, 0.07 - z))
-    spec = mujoco.MjSpec.from_string(limb.mjcf(base, grounding=20e-12))
-    spec.worldbody.add_site(name="pad")
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    for name, angle in bent.items():
-        data.joint(f"person_{name}").qpos[0] = angle
-    mujoco.mj_forward(model, data)
-    simulator = simulators("six_patch_bare", preset="fine")
-    scene = cs.mujoco.attach(model, data, "pad", simulator).scene()
-    assert {b.conductor for b in scene} == {"text capsense.grounding:person_*"}
-    found = simulator.step(scene).delta
-    plain = simulator.step(cs.Scene(limb.bodies(base, bent, grounding=20e-12))).delta
-    apart = [cs.Body(b.shape, b.pose, b.material, b.grounding) for b in scene]
-    split = simulator.step(cs.Scene(apart)).delta
-    assert np.abs(found - plain).max() < 0.01 * np.abs(plain).max()
-    assert np.abs(split - plain).max() > 0.03 * np.abs(plain).max()
-
-
 def _reaches_into(body: cs.Body, domain: object) -> bool:
     """Whether the bounding box of a capsule reaches into the domain."""
     corners = np.stack(np.meshgrid(*body.shape.bounds().T, indexing="ij"), axis=-1).reshape(-1, 3)

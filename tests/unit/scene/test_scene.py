@@ -3,14 +3,12 @@
 import subprocess
 import sys
 import warnings
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 from approximate import approx
 
-from capsense.codec import body_fields, read_body
 from capsense.errors import SceneError
 from capsense.scene import (
     Body,
@@ -177,17 +175,3 @@ def test_a_mesh_of_trimesh() -> None:
     with pytest.raises(SceneError, match=r"give a TriMesh\(mesh\.vertices, mesh\.faces\)"):
         Body(mesh)
     assert Body(TriMesh(mesh.vertices, mesh.faces)).shape.volume == approx(mesh.volume)
-
-
-def test_conductors_have_names() -> None:
-    """A name is kept by what is made of a body, also in recordings, and checked."""
-    body = Body(Sphere(0.01), conductor="robot")
-    moved = body.moved(Pose((1, 0, 0))).pressed(1.0)
-    assert moved.conductor == "robot"
-    message = SimpleNamespace(id=1, shape=2, **body_fields(body))
-    assert read_body(message, {2: body.shape}).conductor == "robot"
-    del message.conductor  # as written by earlier versions
-    assert read_body(message, {2: body.shape}).conductor is None
-    for wrong in ("", 3):
-        with pytest.raises(SceneError, match=r"conductor is .*; give a non-empty string"):
-            Body(Sphere(0.01), conductor=wrong)  # type: ignore[arg-type]

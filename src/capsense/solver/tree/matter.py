@@ -116,10 +116,9 @@ class Matter:
             return (UNIT / self.ground).astype(complex)
 
     def joined(self, scene: Scene, packed: PackedScene, chosen: NDArray[np.intp]) -> Matter:
-        """Take conductors that touch, or are of one name, for one, on the sum of their ties.
+        """Take conductors that touch each other for one, on the sum of their ties to ground.
 
-        Meshes and depth images are not looked at for contact, nor are bodies that are all at
-        ground.
+        Meshes and depth images are not looked at, nor are bodies that are all at ground.
         """
         if not self.some_free:
             return self
@@ -128,12 +127,6 @@ class Matter:
         low, high = packed.bounds[chosen, 0] - 0.5 * near, packed.bounds[chosen, 1] + 0.5 * near
         close = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2)
         close &= seen[:, None] & seen & (self.free[:, None] | self.free)
-        named: dict[str, int] = {}
-        group = np.arange(len(chosen))
-        for k, body in enumerate(scene[int(i)] for i in chosen):
-            if body.conductor is not None and self.conducting[k]:
-                group[k] = named.setdefault(body.conductor, k)
-        close &= group[:, None] != group
         first, second = np.nonzero(np.triu(close, 1))
         apart = parted(
             chosen[np.stack([first, second], axis=1)],
@@ -142,6 +135,7 @@ class Matter:
         first, second = first[~apart], second[~apart]
         ends, radius = _axes(packed, chosen)
         gaps = segment_distance(ends[first], ends[second]) - radius[first] - radius[second]
+        group = np.arange(len(chosen))
         for a, b, gap in zip(first.tolist(), second.tolist(), gaps.tolist(), strict=True):
             if group[a] == group[b]:
                 continue
