@@ -4,6 +4,8 @@
 - :mod:`~capsense.humans.limb`: their arms, legs and hands
 - :mod:`~capsense.humans.fingers`: bones and joints of the hand
 - :mod:`~capsense.humans.chain`: trees of capsules with joints
+- :mod:`~capsense.humans.tracking`: joints of hands as trackers report them, filtered
+- :mod:`~capsense.humans.tracked_hand`: a hand that follows them
 - :mod:`~capsense.humans.formats`: these as MJCF and URDF; meshes of the SMPL family
 """
 
@@ -11,5 +13,10 @@ from capsense.humans.build import Build
 from capsense.humans.chain import Joint, LimbPart, Segment
 from capsense.humans.formats import load_smplx
 from capsense.humans.limb import Limb, arm, hand, leg
+from capsense.humans.tracked_hand import TrackedHand
+from capsense.humans.tracking import HandFilter, HandSample, OneEuroFilter
 
-__all__ = ["Build", "Joint", "Limb", "LimbPart", "Segment", "arm", "hand", "leg", "load_smplx"]
+__all__ = [
+    "Build", "HandFilter", "HandSample", "Joint", "Limb", "LimbPart", "OneEuroFilter", "Segment",
+    "TrackedHand", "arm", "hand", "leg", "load_smplx",
+]  # fmt: skip
