@@ -6,17 +6,19 @@
 - :mod:`~capsense.humans.chain`: trees of capsules with joints
 - :mod:`~capsense.humans.tracking`: joints of hands as trackers report them, filtered
 - :mod:`~capsense.humans.tracked_hand`: a hand that follows them
+- :mod:`~capsense.humans.hand_recording`: files of them
 - :mod:`~capsense.humans.formats`: these as MJCF and URDF; meshes of the SMPL family
 """
 
 from capsense.humans.build import Build
 from capsense.humans.chain import Joint, LimbPart, Segment
 from capsense.humans.formats import load_smplx
+from capsense.humans.hand_recording import HandRecording
 from capsense.humans.limb import Limb, arm, hand, leg
 from capsense.humans.tracked_hand import TrackedHand
 from capsense.humans.tracking import HandFilter, HandSample, OneEuroFilter
 
 __all__ = [
-    "Build", "HandFilter", "HandSample", "Joint", "Limb", "LimbPart", "OneEuroFilter", "Segment",
+    "Build", "HandFilter", "HandRecording", "HandSample", "Joint", "Limb", "LimbPart", "OneEuroFilter", "Segment",
     "TrackedHand", "arm", "hand", "leg", "load_smplx",
 ]  # fmt: skip

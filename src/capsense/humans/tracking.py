@@ -135,7 +135,7 @@ class OneEuroFilter:
     """
 
     def __init__(
-        self, min_cutoff: float = 1.5, beta: float = 40.0, derivative_cutoff: float = 3.0
+        self, min_cutoff: float = 1.5, beta: float = 80.0, derivative_cutoff: float = 3.0
     ) -> None:
         self.min_cutoff = _positive("min_cutoff", min_cutoff, "Hz")
         self.beta = _positive("beta", beta, "Hz/(m/s)", zero=True)
@@ -319,7 +319,7 @@ class HandFilter:
 
     def _completed(self, found: Array) -> Array | None:
         """Landmarks with those that are missing moved along with the palm; None: too few."""
-        there: NDArray[np.bool_] = np.isfinite(found).all(axis=1)
+        there = np.asarray(np.isfinite(found).all(axis=1))
         if there.all():
             return found
         palm = [k for k in PALM if there[k]]
