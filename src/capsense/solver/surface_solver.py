@@ -353,7 +353,7 @@ class SurfaceSolver:
         """Find the bodies of a scene that reach into the domain."""
         packed = scene.pack()
         met = overlapping(packed.bounds, *(self.length * self._sight))
-        matter = self.matter_of([scene[k] for k in met.tolist()])
+        matter = self.matter_of(list(scene)).repeated(met.tolist())
         return View(scene, packed, met, matter)
 
     def matter_of(self, bodies: Sequence[Body]) -> Matter:
