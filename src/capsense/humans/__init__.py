@@ -19,6 +19,6 @@ from capsense.humans.tracked_hand import TrackedHand
 from capsense.humans.tracking import HandFilter, HandSample, OneEuroFilter
 
 __all__ = [
-    "Build", "HandFilter", "HandRecording", "HandSample", "Joint", "Limb", "LimbPart", "OneEuroFilter", "Segment",
-    "TrackedHand", "arm", "hand", "leg", "load_smplx",
+    "Build", "HandFilter", "HandRecording", "HandSample", "Joint", "Limb", "LimbPart",
+    "OneEuroFilter", "Segment", "TrackedHand", "arm", "hand", "leg", "load_smplx",
 ]  # fmt: skip

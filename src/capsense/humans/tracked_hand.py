@@ -179,7 +179,7 @@ class TrackedHand:
 
     def bodies(
         self, landmarks: ArrayLike | None, *, material: Material | str = "human",
-        grounding: Grounding = 100e-12,
+        grounding: Grounding = 100e-12, conductor: str | None = None,
     ) -> list[Body]:  # fmt: skip
         """The hand as bodies of a scene.
 
@@ -188,6 +188,8 @@ class TrackedHand:
             material: What it is made of.
             grounding: ``"grounded"``, ``"floating"``, or the capacitance [F] that ties the whole
                 person to ground.
+            conductor: Bodies of one name are one conductor; give it to both hands of a person. By
+                default the name of the hand, ``"right_hand"``.
 
         Returns:
             The bodies, always of the same shapes; none of an absent hand.
@@ -198,11 +200,8 @@ class TrackedHand:
         if landmarks is None:
             return []
         where = self.poses(landmarks)
-        parts = [(s.name, part) for s in self.limb.segments for part in s.parts]
-        return [
-            body.moved(where[name] @ part.pose)
-            for body, (name, part) in zip(self._at_rest(material, grounding), parts, strict=True)
-        ]
+        made = self._made(material, grounding, conductor or self.limb.name)
+        return [body.moved(where[name] @ part.pose) for name, part, body in made]
 
     def fit(self, frames: ArrayLike) -> TrackedHand:
         """The same hand with the lengths of bones and the palm that a tracker reports.
@@ -277,13 +276,21 @@ class TrackedHand:
 
     # -- the model -------------------------------------------------------------------------------
 
-    def _at_rest(self, material: Material | str, grounding: Grounding) -> list[Body]:
-        """The bodies of the model, made once."""
-        if (kept := self.__dict__.get("_made")) is None or kept[0] != (material, grounding):
-            bodies = self.limb.bodies(material=material, grounding=grounding)
-            kept = self.__dict__["_made"] = (material, grounding), bodies
-        made: list[Body] = kept[1]
-        return made
+    def _made(
+        self, material: Material | str, grounding: Grounding, conductor: str
+    ) -> list[tuple[str, LimbPart, Body]]:
+        """Each part with the name of its segment and its body; made once."""
+        kept = self.__dict__.get("_kept")
+        if kept is None or kept[0] != (material, grounding, conductor):
+            made = [
+                (s.name, part, Body(part.shape, Pose(), material, grounding, name,
+                                    conductor=conductor))
+                for s in self.limb.segments
+                for name, part in self.limb.named_parts(s)
+            ]  # fmt: skip
+            kept = self.__dict__["_kept"] = (material, grounding, conductor), made
+        found: list[tuple[str, LimbPart, Body]] = kept[1]
+        return found
 
     @cached_property
     def _segments(self) -> dict[str, Segment]:
