@@ -74,9 +74,9 @@ def play(
     return Played(samples, np.array(raw), np.array(delta), np.array(steps), np.array(hands))
 
 
-def show(recording: HandRecording, port: int) -> None:
+def show(recording: HandRecording, port: int, preset: str = "standard") -> None:
     """Play in the live view, again and again."""
-    with cs.show(cs.Simulator("six_patch"), port=port) as page:
+    with cs.show(cs.Simulator("six_patch", preset=preset), port=port) as page:
         print(f"{page.url}, Ctrl-C ends it", flush=True)
         with suppress(KeyboardInterrupt):
             while True:
@@ -123,10 +123,10 @@ def draw(recording: HandRecording, played: Played, path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def main(folder: Path, recording: Path = RECORDING) -> Played:
+def main(folder: Path, recording: Path = RECORDING, preset: str = "standard") -> Played:
     """Play, print and draw."""
     found = HandRecording.load(recording)
-    played = play(found, cs.Simulator("six_patch").step)
+    played = play(found, cs.Simulator("six_patch", preset=preset).step)
     report(found, played)
     folder.mkdir(parents=True, exist_ok=True)
     draw(found, played, folder / "hand_over_six_patch.png")
@@ -138,9 +138,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, nargs="?", default=Path("out"))
     parser.add_argument("--recording", type=Path, default=RECORDING)
+    parser.add_argument("--preset", default="standard", help="of the simulator")
     parser.add_argument("--show", type=int, nargs="?", const=8080, metavar="PORT")
     words = parser.parse_args()
     if words.show is None:
-        main(words.folder, words.recording)
+        main(words.folder, words.recording, words.preset)
     else:
-        show(HandRecording.load(words.recording), words.show)
+        show(HandRecording.load(words.recording), words.show, words.preset)
