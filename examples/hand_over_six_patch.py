@@ -12,6 +12,7 @@ hand is lost.
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -78,9 +79,14 @@ def show(recording: HandRecording, port: int, preset: str = "standard") -> None:
     """Play in the live view, again and again."""
     with cs.show(cs.Simulator("six_patch", preset=preset), port=port) as page:
         print(f"{page.url}, Ctrl-C ends it", flush=True)
+        length = recording.time[-1] + 1.0 / 60.0
         with suppress(KeyboardInterrupt):
-            while True:
-                play(recording, page.step, real_time=True)
+            for begin in itertools.count(0.0, length):
+
+                def step(scene: cs.Scene, *, time: float, begin: float = begin) -> cs.Reading:
+                    return page.step(scene, time=begin + time)
+
+                play(recording, step, real_time=True)
 
 
 def report(recording: HandRecording, played: Played) -> None:
