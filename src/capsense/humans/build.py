@@ -7,8 +7,9 @@ segments are fractions of body mass: Winter, table 4.1.
 
 Circumferences are means over 4082 men and 1986 women: C. C. Gordon et al., "2012 Anthropometric
 Survey of U.S. Army Personnel: Methods and Summary Statistics" (ANSUR II), NATICK/TR-15/007,
-2014. Those of upper arm and forearm were taken flexed, so they are the largest. The survey's
-people are fit adults; others are reached with ``girth``.
+2014, and were taken from its public data, as were heights, breadths and depths. Those of upper
+arm and forearm were taken flexed, so they are the largest. The survey's people are fit adults;
+others are reached with ``girth``.
 
 The spread of stature is the distance of the 5th from the 95th percentile in R. L. Huston,
 "Principles of Biomechanics", CRC Press, 2009 (men 1.649 to 1.869 m, women 1.518 to 1.724 m),
@@ -42,6 +43,14 @@ STATURE: Mapping[Sex, tuple[float, float]] = MappingProxyType(DATA["stature"])
 """Mean [m] (ANSUR II) and standard deviation [m] (Huston 2009) of stature."""
 CIRCUMFERENCES: Mapping[str, Mapping[Sex, float]] = MappingProxyType(DATA["circumferences"])
 """Mean circumferences [m] at mean stature (ANSUR II)."""
+HEIGHTS: Mapping[str, Mapping[Sex, float]] = MappingProxyType(DATA["heights"])
+"""Mean heights above the floor [m] at mean stature (ANSUR II)."""
+SECTIONS: Mapping[str, Mapping[Sex, tuple[float, float]]] = MappingProxyType(DATA["sections"])
+"""Mean breadth and depth [m] at mean stature (ANSUR II); of the head, breadth and length."""
+CHEST_DEPTH: Mapping[Sex, float] = MappingProxyType(DATA["chest_depth"])
+"""Mean depth of the chest [m] at mean stature (ANSUR II)."""
+SHOULDER_BREADTH: Mapping[Sex, float] = MappingProxyType(DATA["shoulder_breadth"])
+"""Mean breadth over the deltoids [m] at mean stature (ANSUR II)."""
 HAND_BREADTH: Mapping[Sex, float] = MappingProxyType(DATA["hand_breadth"])
 """Mean breadth of the hand at the knuckles [m] at mean stature (ANSUR II)."""
 ANKLE = 0.13
@@ -94,6 +103,42 @@ class Build:
     def length(self, name: str) -> float:
         """A length [m] of :data:`LENGTHS`."""
         return LENGTHS[name] * self.height
+
+    def level(self, name: str) -> float:
+        """A height above the floor [m] of :data:`HEIGHTS`."""
+        return HEIGHTS[name][self.sex] * self._scale
+
+    def section(self, name: str) -> tuple[float, float]:
+        """Breadth and depth [m] of a section of the trunk, of :data:`SECTIONS`.
+
+        That of the chest is a stadium of known depth and circumference. The head has the same size
+        at any girth.
+        """
+        if name == "chest":
+            depth = self.girth * CHEST_DEPTH[self.sex] * self._scale
+            around = 2 * math.pi * self.radius("chest")
+            return depth + 0.5 * (around - math.pi * depth), depth
+        breadth, depth = SECTIONS[name][self.sex]
+        factor = self._scale * (1.0 if name == "head" else self.girth)
+        return factor * breadth, factor * depth
+
+    @property
+    def shoulder_spacing(self) -> float:
+        """Distance [m] between the shoulder centres.
+
+        At a girth of 1, the shoulders are as broad as surveyed: over the upper arms.
+        """
+        around = CIRCUMFERENCES["upper arm"][self.sex]
+        return self._scale * (SHOULDER_BREADTH[self.sex] - around / math.pi)
+
+    @property
+    def hip_spacing(self) -> float:
+        """Distance [m] between the hip centres.
+
+        At a girth of 1, the hips are as broad as surveyed: over the thighs.
+        """
+        around = CIRCUMFERENCES["thigh"][self.sex]
+        return self._scale * (SECTIONS["hips"][self.sex][0] - around / math.pi)
 
     def segment_mass(self, name: str) -> float:
         """The mass [kg] of a segment of :data:`MASSES`."""

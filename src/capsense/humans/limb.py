@@ -1,4 +1,4 @@
-"""Arms, legs and hands, as trees of capsules with joints.
+"""Arms, legs and hands, as trees of capsules with joints; what they share with whole people.
 
 At rest, all angles zero, a limb hangs straight down: x points forwards, y to the left, z up. The
 limb's frame stands at the shoulder, hip or wrist centre. Positive angles bend as the joint's name
@@ -8,13 +8,12 @@ says, on both sides of the body alike.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from capsense._validate import suggest
 from capsense.errors import SceneError
 from capsense.humans.build import DATA, Build
 from capsense.humans.chain import Chain, Joint, LimbPart, Segment
@@ -30,30 +29,7 @@ Hands = Literal["simple", "detailed"]
 
 @dataclass(frozen=True)
 class Limb(Chain):
-    """An arm, a leg or a hand; made by :func:`arm`, :func:`leg` and :func:`hand`."""
-
-    def forward(
-        self, angles: Mapping[str, float] | None = None, *, degrees: bool = False
-    ) -> dict[str, Pose]:
-        """Poses of the segments in the limb's frame.
-
-        Args:
-            angles: Angle of each joint by name [rad]; those not given are zero.
-            degrees: Whether the angles are in degrees.
-
-        Raises:
-            SceneError: There is no such joint, or it does not bend so far.
-        """
-        checked = self._checked(angles or {}, degrees)
-        poses: dict[str | None, Pose] = {None: Pose()}
-        for segment in self.segments:
-            here = poses[segment.parent] @ Pose(segment.origin)
-            for joint in segment.joints:
-                half = 0.5 * checked.get(joint.name, 0.0)
-                x, y, z = (math.sin(half) * a for a in joint.axis)
-                here = here @ Pose((0, 0, 0), (x, y, z, math.cos(half)))
-            poses[segment.name] = here
-        return {name: pose for name, pose in poses.items() if name is not None}
+    """A limb or person; made by :func:`arm`, :func:`leg`, :func:`hand` and :func:`person`."""
 
     def bodies(
         self,
@@ -67,7 +43,8 @@ class Limb(Chain):
         """The limb as bodies of a scene.
 
         Args:
-            pose: The limb's frame (shoulder, hip or wrist centre) in the sensor frame.
+            pose: The limb's frame (shoulder, hip or wrist centre, or between the hips) in the
+                sensor frame.
             angles: Angle of each joint by name [rad]; those not given are zero.
             degrees: Whether the angles are in degrees.
             material: What it is made of.
@@ -81,12 +58,39 @@ class Limb(Chain):
         tie = checked_grounding(grounding)
         if not isinstance(tie, str):
             tie /= sum(len(s.parts) for s in self.segments)
-        where = self.forward(angles, degrees=degrees)
+        where = {n: pose @ at for n, at in self.forward(angles, degrees=degrees).items()}
         return [
-            Body(part.shape, pose @ where[segment.name] @ part.pose, material, tie, name)
+            Body(part.shape, where[segment.name] @ part.pose, material, tie, name)
             for segment in self.segments
             for name, part in self.named_parts(segment)
         ]
+
+    def on_floor(
+        self,
+        angles: Mapping[str, float] | None = None,
+        *,
+        degrees: bool = False,
+        turn: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        floor: float = 0.0,
+    ) -> Pose:
+        """The pose of the limb's frame, above the origin, whose lowest point is on a floor.
+
+        Args:
+            angles: Angle of each joint by name [rad]; those not given are zero.
+            degrees: Whether the angles are in degrees.
+            turn: Quaternion (x, y, z, w) of the frame, :data:`~capsense.humans.ON_BACK` say.
+            floor: Height of the floor [m]; soles or a seat lift it.
+
+        Raises:
+            SceneError: A joint, an angle or the quaternion is wrong.
+        """
+        turned, where = Pose((0.0, 0.0, 0.0), turn), self.forward(angles, degrees=degrees)
+        low = min(
+            float((turned @ where[s.name]).apply([p.start, p.end])[:, 2].min()) - p.radius
+            for s in self.segments
+            for p in s.parts
+        )
+        return Pose((0.0, 0.0, floor - low), turn)
 
     def mjcf(self, pose: Pose = Pose(), **options: object) -> str:  # noqa: B008
         """A MuJoCo model of the limb; see :func:`capsense.humans.formats.to_mjcf`."""
@@ -95,23 +99,6 @@ class Limb(Chain):
     def urdf(self) -> str:
         """A URDF of the limb; see :func:`capsense.humans.formats.to_urdf`."""
         return to_urdf(self)
-
-    def _checked(self, angles: Mapping[str, float], degrees: bool) -> dict[str, float]:
-        """Angles [rad], refused where a joint is missing or does not bend so far."""
-        joints = {j.name: j for j in self.joints}
-        out = {}
-        for name, value in angles.items():
-            if name not in joints:
-                raise SceneError(f"{self.name} has no joint {name!r}; {suggest(name, joints)}")
-            joint = joints[name]
-            angle = math.radians(value) if degrees else float(value)
-            if not joint.lower - 1e-9 <= angle <= joint.upper + 1e-9:
-                raise SceneError(
-                    f"{self.name}: {name} is {math.degrees(angle):.4g} degrees; it bends from "
-                    f"{math.degrees(joint.lower):.4g} to {math.degrees(joint.upper):.4g}"
-                )
-            out[name] = angle
-        return out
 
 
 def arm(
@@ -152,7 +139,7 @@ def leg(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
     Raises:
         SceneError: Another side.
     """
-    return Limb(f"{_sided(side)}_leg", _segments("leg", build, side))
+    return Limb(f"{_sided(side)}_leg", leg_segments(build, side))
 
 
 def hand(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
@@ -177,7 +164,7 @@ def hand(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
         SceneError: Another side.
     """
     mirror = _sign(side)
-    wrist = _joints(DATA["arm"][-1], mirror)
+    wrist = joints_of(DATA["arm"][-1]["joints"], mirror)
     return Limb(f"{side}_hand", hand_segments(build, mirror, wrist, (0.0, 0.0, 0.0)))
 
 
@@ -191,6 +178,11 @@ def arm_segments(build: Build, side: Side, hand: Hands) -> tuple[Segment, ...]:
     *above, last = found
     detailed = hand_segments(build, _sign(side), last.joints, last.origin)
     return (*above, replace(detailed[0], parent=last.parent), *detailed[1:])
+
+
+def leg_segments(build: Build, side: Side) -> tuple[Segment, ...]:
+    """The segments of a leg, see :func:`leg`."""
+    return _segments("leg", build, side)
 
 
 def _segments(kind: str, build: Build, side: Side) -> tuple[Segment, ...]:
@@ -207,13 +199,13 @@ def _segments(kind: str, build: Build, side: Side) -> tuple[Segment, ...]:
             parts = _along(length, mean)
         mass = build.segment_mass(name)
         name = name.replace(" ", "_")
-        out.append(Segment(name, origin, _joints(data, mirror), parts, mass, parent))
+        out.append(Segment(name, origin, joints_of(data["joints"], mirror), parts, mass, parent))
         origin, parent = (0.0, 0.0, -length), name
     return tuple(out)
 
 
-def _joints(data: Mapping[str, Any], mirror: float) -> tuple[Joint, ...]:
-    """The joints of a segment; those of the left side mirror."""
+def joints_of(data: Iterable[Any], mirror: float = 1.0) -> tuple[Joint, ...]:
+    """Joints as ``people.toml`` lists them; those of the left side mirror."""
     return tuple(
         Joint(
             name,
@@ -221,7 +213,7 @@ def _joints(data: Mapping[str, Any], mirror: float) -> tuple[Joint, ...]:
             math.radians(low),
             math.radians(high),
         )
-        for name, (x, y, z), low, high in data["joints"]
+        for name, (x, y, z), low, high in data
     )
 
 
