@@ -35,6 +35,9 @@ PALM = (0, 1, 5, 9, 13, 17)
 """Landmarks that keep their distances when the fingers bend: the wrist and where fingers start."""
 MIN_PALM = 3
 """Fewest landmarks of the palm that say how a hand has moved."""
+REACH, FARTHEST = 0.5, 1e3
+"""A landmark farther from the middle of the others than this [m], or from the origin than that, is
+no landmark of a hand that a tracker sees."""
 
 
 @dataclass(frozen=True)
@@ -205,6 +208,7 @@ class HandFilter:
       three landmarks of the palm, or landmarks that were never seen are missing in it. Single
       landmarks that are missing move along with the palm. A silence of more than ``hold`` counts
       as missed frames too.
+    - A landmark more than 0.5 m from the middle of the hand counts as missing.
     - Missed frames: for ``hold`` seconds the hand stays where it was. Then it moves along
       ``retreat`` within ``fade`` seconds, and is absent.
     - When it is seen again, it moves to where it is seen within ``fade`` seconds: from where it
@@ -272,7 +276,7 @@ class HandFilter:
         """
         if not math.isfinite(now := as_number(time)):
             raise SceneError(f"time is {time!r}; give seconds, a finite number")
-        found = None if landmarks is None else as_joints(landmarks, LANDMARKS, "landmarks")
+        found = None if landmarks is None else _plausible(landmarks)
         if now <= self.sample.time:
             self.dropped += 1
             return self.sample
@@ -327,6 +331,17 @@ class HandFilter:
             return None
         rotation, shift = rigid_motion(self._known[palm], found[palm])
         return np.where(there[:, None], found, self._known @ rotation.T + shift)
+
+
+def _plausible(landmarks: ArrayLike) -> Array:
+    """Landmarks, NaN for those that cannot be of a hand."""
+    found = as_joints(landmarks, LANDMARKS, "landmarks")
+    found[(np.abs(found) > FARTHEST).any(axis=1)] = math.nan
+    there = np.isfinite(found[:, 0])
+    if there.any():
+        away = np.linalg.norm(found - np.median(found[there], axis=0), axis=1)
+        found[away > REACH] = math.nan
+    return found
 
 
 def _smoothstep(x: float) -> float:

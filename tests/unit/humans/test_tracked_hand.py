@@ -123,6 +123,13 @@ def test_fit_takes_lengths_from_the_tracker(seed: int) -> None:
                       for _ in range(12)])  # fmt: skip
     fitted = model.fit(exact)
     assert fitted.limb.joints == model.limb.joints
+    palm, *others = fitted.limb.segments
+    knuckles = [s.origin for s in others if s.name.endswith("_proximal") and "thumb" not in s.name]
+    np.testing.assert_allclose([p.end for p in palm.parts], knuckles, atol=1e-12)
+    wanted = person.limb.segments[0].parts
+    np.testing.assert_allclose(
+        [p.start for p in palm.parts], [p.start for p in wanted], atol=2e-3
+    )  # estimated: they scale with the knuckles
     for one, two in zip(fitted.limb.segments, model.limb.segments, strict=True):
         assert [p.radius for p in one.parts] == [p.radius for p in two.parts]
     for landmarks in exact:

@@ -244,6 +244,23 @@ def test_single_joints_that_are_missing_move_with_the_palm(seed: int) -> None:
     assert tracker.update(0.2, seen).status == "held"
 
 
+@pytest.mark.parametrize("value", [3.0, -1e5, 1e300, math.inf])
+def test_glitches_leave_no_trace(value: float) -> None:
+    """A landmark that is metres away is missing; a frame of such is missed."""
+    hand = random_hand(1)
+    tracker = HandFilter()
+    for k in range(10):
+        tracker.update(k / RATE, hand)
+    glitch = hand.copy()
+    glitch[8] = value
+    np.testing.assert_allclose(tracker.update(10 / RATE, glitch).landmarks, hand, atol=1e-9)
+    assert tracker.update(11 / RATE, np.full((21, 3), 1e300)).status == "held"
+    for k in range(12, 40):
+        sample = tracker.update(k / RATE, hand)
+    assert sample.status == "tracked"
+    np.testing.assert_allclose(sample.landmarks, hand, atol=1e-9)
+
+
 def test_frames_that_do_not_count() -> None:
     """Late ones are dropped, unsure and incomplete ones missed; after a reset time begins anew."""
     hand = random_hand(1)
