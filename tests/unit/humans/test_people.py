@@ -183,7 +183,7 @@ def test_postures_keep_the_limbs_apart(posture: str, build: Build) -> None:
         ("left_leg", "right_leg", 0.065),
     ):
         deep = max(overlap(a, b) for a in of[first] for b in of[second])
-        assert deep < most + 0.1 * (build.girth - 1.0), (first, second)
+        assert deep < most + 0.25 * (build.girth - 1.0), (first, second)
     feet = [[b for b in of[f"{s}_leg"] if "thigh" not in str(b.name)] for s in ("left", "right")]
     assert max(overlap(a, b) for a in feet[0] for b in feet[1]) < 0
 
