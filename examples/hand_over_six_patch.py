@@ -126,7 +126,7 @@ def draw(recording: HandRecording, played: Played, path: Path) -> None:
         )  # fmt: skip
         dress(axes)
         axes.legend(**LEGEND)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=110)
 
 
 def main(folder: Path, recording: Path = RECORDING, preset: str = "standard") -> Played:
