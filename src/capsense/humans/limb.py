@@ -49,7 +49,8 @@ class Limb(Chain):
             degrees: Whether the angles are in degrees.
             material: What it is made of.
             grounding: ``"grounded"``, ``"floating"``, or the capacitance [F] that ties the
-                whole person to ground; the bodies share it. A standing person has about 100 pF.
+                whole person to ground, :func:`~capsense.humans.capacitance_to_ground` say. The
+                bodies share it; as they touch, they are one conductor on all of it.
 
         Raises:
             SceneError: A joint, an angle, the material or the grounding is wrong.

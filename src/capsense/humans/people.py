@@ -41,6 +41,7 @@ def person(
     build: Build = Build(),  # noqa: B008, a build is immutable
     *,
     hands: Hands = "simple",
+    name: str = "person",
 ) -> Limb:
     """A whole person; the frame stands midway between the hip centres.
 
@@ -55,6 +56,7 @@ def person(
         build: Size of the person.
         hands: ``"simple"``, five capsules each, or ``"detailed"``, with all finger joints, as
             :func:`~capsense.humans.hand` makes them.
+        name: Prefix of the names of bodies; it tells people apart who share a scene.
 
     Raises:
         SceneError: Other hands.
@@ -69,7 +71,7 @@ def person(
     for side, y in zip(SIDES, (1.0, -1.0), strict=True):
         place = (0.0, 0.5 * y * build.hip_spacing, 0.0)
         segments += _hung(leg_segments(build, side), side, "pelvis", place)
-    return Limb("person", tuple(segments), POSTURES["standing"])
+    return Limb(name, tuple(segments), POSTURES["standing"])
 
 
 def _hung(
@@ -94,22 +96,24 @@ def _trunk(build: Build) -> list[Segment]:
     rib, top = build.level("tenth rib"), build.level("suprasternale")
     base = 0.5 * (top + build.level("cervicale"))
     chest, waist, hips = (build.section(name) for name in ("chest", "waist", "hips"))
-    below = build.level("crotch") - hip
-    pelvis = _pair(hips, hips, below + 0.5 * hips[1], lumbar - hip)
+    bottom = min(build.level("crotch") + 0.5 * hips[1], 0.5 * (hip + lumbar)) - hip
+    pelvis = _pair(hips, hips, bottom, lumbar - hip)
+    upper = top - 0.5 * chest[1] - lumbar
     sides = (waist[0] - waist[1] + chest[1], chest[1])
     thorax = (
         *_pair(waist, waist, 0.0, rib - lumbar),
-        *_pair(sides, chest, rib - lumbar, top - 0.5 * chest[1] - lumbar),
+        *_pair(sides, chest, rib - lumbar, upper),
+        LimbPart((0.0, 0.0, upper), (0.0, 0.0, base - lumbar), build.radius("neck")),
         *_girdle(build, base, lumbar),
     )
-    throat, skull = _head(build, base)
+    throat, skull, middle = _head(build, base)
     joints = {name: joints_of(data) for name, data in DATA["trunk"].items()}
-    upper = build.segment_mass("thorax and abdomen")
+    mass = build.segment_mass("thorax and abdomen")
     neck = Segment("neck", (0.0, 0.0, base - lumbar), joints["neck"], throat, 0.0, "chest")
-    head = Segment("head", throat[0].end, (), skull, 0.0, "neck")
+    head = Segment("head", middle, (), skull, 0.0, "neck")
     return [
         Segment("pelvis", (0.0, 0.0, 0.0), (), pelvis, build.segment_mass("pelvis")),
-        Segment("chest", (0.0, 0.0, lumbar - hip), joints["chest"], thorax, upper, "pelvis"),
+        Segment("chest", (0.0, 0.0, lumbar - hip), joints["chest"], thorax, mass, "pelvis"),
         *scaled_masses((neck, head), build.segment_mass("head and neck")),
     ]
 
@@ -137,14 +141,21 @@ def _girdle(build: Build, base: float, lumbar: float) -> tuple[LimbPart, ...]:
     )
 
 
-def _head(build: Build, base: float) -> tuple[tuple[LimbPart, ...], tuple[LimbPart, ...]]:
-    """Neck, up to the middle of the skull; skull and face, from there."""
+def _head(
+    build: Build, base: float
+) -> tuple[tuple[LimbPart, ...], tuple[LimbPart, ...], tuple[float, float, float]]:
+    """Neck; skull and face; the middle of the skull [m], from the base of the neck."""
     breadth, length = build.section("head")
     radius, half = 0.5 * breadth, 0.5 * (length - breadth)
-    ahead, middle = 0.01 * build.height, build.height - radius - base
-    throat = LimbPart((0.0, 0.0, 0.0), (ahead, 0.0, middle), build.radius("neck"))
+    middle = (0.01 * build.height, 0.0, build.height - radius - base)
+    around = build.radius("neck")
+    throat = min(middle[2], middle[2] + radius - around - 0.1 * radius)
     face = 0.7 * radius
     chin = build.length("chin height") + face - (build.height - radius)
     skull = LimbPart((-half, 0.0, 0.0), (half, 0.0, 0.0), radius)
     front = half + 0.8 * (radius - face)
-    return (throat,), (skull, LimbPart((front, 0.0, 0.0), (front, 0.0, chin), face))
+    return (
+        (LimbPart((0.0, 0.0, 0.0), (middle[0], 0.0, throat), around),),
+        (skull, LimbPart((front, 0.0, 0.0), (front, 0.0, chin), face)),
+        middle,
+    )

@@ -31,8 +31,8 @@ def test_a_limb_reads_the_same(
 ) -> None:
     """Differential: tied to ground by 100 pF in all three.
 
-    Measured 0.18 % of an arm and 0.7 % of a person in MuJoCo, which rolls capsules about their axes,
-    with fine panels; 2 % where the arm is raised by 1 mm.
+    Measured 0.18 % of an arm and 0.7 % of a person in MuJoCo, which rolls capsules about their
+    axes, with fine panels; 2 % where the arm is raised by 1 mm.
     """
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
     p = pytest.importorskip("pybullet", reason="PyBullet is not installed")

@@ -29,6 +29,9 @@ from capsense.solver.tree.matter import matter_of
 BUILDS = [Build("male"), Build("female"), Build("female", stature=1.5, girth=1.3)]
 REACH = POSTURES["standing"] | {"right_shoulder_flexion": 1.5, "right_wrist_flexion": 0.3}
 """The right arm held out ahead."""
+EXTREMES = [
+    Build(sex, stature=h, girth=g) for sex, h in (("male", 2.3), ("female", 0.8)) for g in (0.5, 2)
+]  # type: ignore[arg-type]
 DOWN = cs.Pose((0, 0, 0), (0, math.sqrt(0.5), 0, math.sqrt(0.5)))
 """What is ahead is below."""
 
@@ -60,7 +63,7 @@ def over_a_sensor(limb: Limb, gap: float, grounding: Any) -> list[cs.Body]:
 # -- sizes ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("build", BUILDS, ids=str)
+@pytest.mark.parametrize("build", BUILDS + EXTREMES, ids=str)
 def test_a_person_is_as_tall_as_its_stature(build: Build) -> None:
     """Standing on the floor, at ease; the soles are level with it."""
     limb = person(build)
@@ -104,6 +107,8 @@ def test_limbs_of_a_person_are_those_alone() -> None:
     assert whole["left_upper_arm"].parent == "chest"
     assert whole["right_thigh"].parent == "pelvis"
     assert whole["left_thigh"].origin[1] == approx(0.5 * build.hip_spacing)
+    both = [b for name in ("anna", "ben") for b in person(build, name=name).bodies()]
+    assert cs.Scene(both)["anna_left_foot_1"].shape == cs.Scene(both)["ben_left_foot_1"].shape
     with pytest.raises(SceneError, match="hand is 'none'; choose"):
         person(hands="none")  # type: ignore[arg-type]
 
@@ -204,7 +209,7 @@ def test_on_floor() -> None:
 
 
 @pytest.mark.parametrize("hands", ["simple", "detailed"])
-@pytest.mark.parametrize("build", BUILDS, ids=str)
+@pytest.mark.parametrize("build", BUILDS + EXTREMES, ids=str)
 def test_a_person_is_one_conductor(build: Build, hands: Any) -> None:
     """All parts touch, in all postures and at any angles."""
     limb = person(build, hands=hands)
