@@ -15,7 +15,7 @@ from capsense.constants import UNIT
 from capsense.design.model import Design
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.face import sheet_on_face
-from capsense.field.face_kernels import WALL_FADE_LENGTH
+from capsense.field.face_kernels import WALL_EDGE
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
 from capsense.field.green_points import narrowest_width
@@ -190,7 +190,7 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain, over ``length``, as :func:`windowed` takes them."""
-        self._sight = self.green.active_bounds + WALL_FADE_LENGTH * self.green.extent * np.array(
+        self._sight = self.green.active_bounds + WALL_EDGE * self.green.extent * np.array(
             [[-1.0], [1.0]]
         )
         """Corners of the box beyond which no charge is, over ``length``, shape (2, 3)."""

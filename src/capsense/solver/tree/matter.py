@@ -168,7 +168,7 @@ class Matter:
         members = np.bincount(self.group, minlength=len(records))[self.group]
         none = np.isinf(ties.real)
         shared = none & (members > 1) & self.conducting
-        records["neutral"] = none & ~shared
+        records["neutral"], records["free"] = none & ~shared, self.free
         records["ground_elastance"] = np.where(
             shared, FLOATING_PENALTY, np.where(none, 0.0, ties.real)
         )
