@@ -6,6 +6,9 @@
 - :mod:`~capsense.humans.people`: whole people, their postures
 - :mod:`~capsense.humans.ground`: their capacitance to ground
 - :mod:`~capsense.humans.chain`: trees of capsules with joints
+- :mod:`~capsense.humans.tracking`: joints of hands as trackers report them, filtered
+- :mod:`~capsense.humans.tracked_hand`: a hand that follows them
+- :mod:`~capsense.humans.hand_recording`: files of them
 - :mod:`~capsense.humans.formats`: these as MJCF and URDF; meshes of the SMPL family
 """
 
@@ -13,17 +16,25 @@ from capsense.humans.build import Build
 from capsense.humans.chain import Joint, LimbPart, Segment
 from capsense.humans.formats import load_smplx
 from capsense.humans.ground import capacitance_to_ground
+from capsense.humans.hand_recording import HandRecording
 from capsense.humans.limb import Limb, arm, hand, leg
 from capsense.humans.people import ON_BACK, POSTURES, person
+from capsense.humans.tracked_hand import TrackedHand
+from capsense.humans.tracking import HandFilter, HandSample, OneEuroFilter
 
 __all__ = [
     "ON_BACK",
     "POSTURES",
     "Build",
+    "HandFilter",
+    "HandRecording",
+    "HandSample",
     "Joint",
     "Limb",
     "LimbPart",
+    "OneEuroFilter",
     "Segment",
+    "TrackedHand",
     "arm",
     "capacitance_to_ground",
     "hand",

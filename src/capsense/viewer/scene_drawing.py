@@ -105,7 +105,8 @@ class SceneDrawing:
         if not same:
             for handle in [h for _, *handles in self._bodies for h in handles]:
                 handle.remove()
-            self._bodies = [self._named(k, b) for k, b in enumerate(bodies)]
+            labels = _labels(bodies)
+            self._bodies = [self._named(k, b, labels.get(k)) for k, b in enumerate(bodies)]
             self._spots = [spots_of(b) for b in bodies]
         for body, (_, *handles) in zip(bodies, self._bodies, strict=True):
             for handle in handles:
@@ -184,8 +185,8 @@ class SceneDrawing:
         faces = np.arange(len(corners)).reshape(-1, 3)
         self._mesh(name, corners, faces, colour, flat_shading=True, side="double")
 
-    def _named(self, number: int, body: Body) -> tuple[Any, ...]:
-        """A body, what is drawn of it, and its name, if it has one and there are not too many."""
+    def _named(self, number: int, body: Body, label: str | None) -> tuple[Any, ...]:
+        """A body, what is drawn of it, and its label, if it has one."""
         name, shape = f"/bodies/{number}", body.shape
         colour = CONDUCTIVE if body.material.is_conductor() else DIELECTRIC
         if isinstance(shape, Layers):
@@ -193,9 +194,11 @@ class SceneDrawing:
         else:
             side = "double" if shape.kind == ShapeKind.SURFACE else "front"
             drawn = self._solid(name, shape, colour, side=side, opacity=0.4)
-        if body.name is None or number >= MAX_LABELS:
-            return body, drawn
-        return body, drawn, self._label(f"/names/{number}", body.name)
+        return (
+            (body, drawn)
+            if label is None
+            else (body, drawn, self._label(f"/names/{number}", label))
+        )
 
     def _solid(self, name: str, shape: Shape, colour: Colour, **options: Any) -> Any:
         mesh = shape.to_trimesh()
@@ -241,6 +244,17 @@ class SceneDrawing:
             name, points, colour, point_size=0.2 * min(width, height), point_shape="circle",
             point_shading="flat",
         )  # fmt: skip
+
+
+def _labels(bodies: Sequence[Body]) -> dict[int, str]:
+    """What is written at which bodies: their names; of one conductor, its name at the first."""
+    first: dict[str, int] = {}
+    found = {}
+    for k, body in enumerate(bodies[:MAX_LABELS]):
+        label = body.conductor or body.name
+        if label is not None and (body.conductor is None or first.setdefault(label, k) == k):
+            found[k] = label
+    return found
 
 
 def _put(handle: Any, pose: Pose) -> None:

@@ -38,6 +38,8 @@ def test_the_robot_in_mujoco() -> None:
         for _ in range(10):
             mujoco.mj_step(model, data)
             reading = page.read()
+        with pytest.raises(TypeError, match=r"call read\(\)"):
+            page.step(cs.Scene())
         assert reading.delta.diagonal().min() > 0
         until(lambda: page.player.newest is not None and page.player.newest.index == 9)
         frame = page.player.newest
@@ -71,6 +73,25 @@ def test_the_robot_in_pybullet() -> None:
         assert frame is not None
         assert [type(shape) for shape, _ in frame.around] == [cs.Box, cs.Sphere]
     p.disconnect(client)
+
+
+def test_a_simulator_by_itself() -> None:
+    """Scenes are stepped and shown as they are; each kind of page says what it is for."""
+    simulator, plain = cs.Simulator("patch"), cs.Simulator("patch")
+    with cs.show(simulator, port=0) as page:
+        for k in range(5):
+            ball = cs.Body(cs.Sphere(0.02), cs.Pose((0, 0, 0.06 - 0.005 * k)), name="ball")
+            reading = page.step(cs.Scene([ball]), time=0.1 * k)
+            np.testing.assert_array_equal(reading.delta, plain.step(cs.Scene([ball])).delta)
+        until(lambda: page.player.newest is not None and page.player.newest.index == 4)
+        frame = page.player.newest
+        assert frame is not None
+        assert (frame.time, frame.around) == (0.4, ())
+        assert frame.scene.bodies[0].pose.position[2] == approx(0.04)
+        page.view.refresh()
+        assert any(name.startswith("/bodies/") for name in nodes_of(page.view.server))
+        with pytest.raises(TypeError, match="call step"):
+            page.read()
 
 
 class Watcher:
@@ -111,7 +132,7 @@ def test_pictures_and_videos() -> None:
         assert video.info["duration"] == 50
 
 
-def test_what_is_on_no_robot() -> None:
-    """A simulator is shown by another command."""
-    with pytest.raises(TypeError, match=r"sensor is of Simulator; .* capsense view"):
-        cs.show(cs.Simulator("six_patch"), port=0)  # type: ignore[arg-type]
+def test_what_is_no_sensor() -> None:
+    """A design is shown by another command."""
+    with pytest.raises(TypeError, match=r"sensor is of Design; .* capsense view"):
+        cs.show(cs.load_design("six_patch"), port=0)  # type: ignore[arg-type]
