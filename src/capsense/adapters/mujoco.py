@@ -44,7 +44,7 @@ _TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
 _ONLY = {
     "geometry": (
         *("materials", "grounding", "exclude", "exclude_own"),
-        *("hull", "groups", "contact_forces"),
+        *("hull", "shapes", "groups", "contact_forces"),
     ),
     "depth_camera": ("camera", "back"),
 }
@@ -54,7 +54,8 @@ class MujocoSkinOptions(AttachOptions, total=False):
     """Keywords of :func:`attach_skin`."""
 
     groups: Collection[int] | None
-    """See only geoms of these groups (MuJoCo's 0 to 5); default all."""
+    """See only geoms of these groups (MuJoCo's 0 to 5); default all. Of these, ``shapes`` chooses
+    those that are seen."""
     contact_forces: bool
     """Whether the forces of MuJoCo's contacts press geoms onto the design's cover, True by default;
     of geoms without contact, the overlap with the cover counts."""
@@ -253,13 +254,16 @@ def _left_out(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
         near: Geoms that reach into the sensor's domain.
     """
     m = source.model
+    if source.groups is None:
+        return []
     taken = np.zeros(m.ngeom, dtype=bool)
     taken[source.geoms] = True
     missed = [
         g
-        for g in np.flatnonzero(~taken & (m.geom_bodyid != own)).tolist()
-        if not source.reader.excludes(g) and not _twins(source, g, taken).any()
-    ]
+        for g in np.flatnonzero(~np.isin(m.geom_group, [*source.groups])).tolist()
+        if m.geom_bodyid[g] != own
+        and not source.reader.excludes(g) and not _twins(source, g, taken).any()
+    ]  # fmt: skip
     seen, root = set(m.geom_bodyid[taken].tolist()), m.body_rootid
     free = (m.body_weldid > 0) | (m.body_mocapid[root] >= 0)
     moving = [
@@ -290,7 +294,7 @@ def _markers(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
         g
         for g in source.geoms
         if g in near and clear[g] and not collide[g] and m.geom_bodyid[g] != own
-        and not source.reader.excludes(g) and not _twins(source, g, collide).any()
+        and not source.reader.excludes(g)
     ]  # fmt: skip
     if not found:
         return []

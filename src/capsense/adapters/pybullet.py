@@ -42,7 +42,6 @@ from capsense.simulator import DEFAULT_DESIGN, Simulator
 from capsense.skin import AnyDesign, SkinLayout
 
 Array = NDArray[np.float64]
-Shapes = Literal["collision", "visual"]
 
 __all__ = [
     "AttachedSkin", "PybulletDepthSensor", "PybulletOptions", "PybulletSensor", "attach",
@@ -66,9 +65,6 @@ _ONLY = {
 class PybulletSkinOptions(AttachOptions, total=False):
     """Keywords of :func:`attach_skin`."""
 
-    shapes: Shapes
-    """``"collision"``, the default: what Bullet collides with, where a mesh is the convex hull of
-    each of its connected parts; or ``"visual"``: what it draws, meshes as they are."""
     contact_forces: bool
     """Whether the forces of Bullet's contacts press links onto the design's cover, True by default;
     of links without contact, the overlap with the cover counts."""
@@ -132,7 +128,6 @@ def attach(
     require_package("pybullet", "PyBullet", "pybullet")
     check_perception(perception, options, _ONLY)
     rules, other = split_rules(options, PybulletOptions)
-    shapes = _checked_shapes(other.pop("shapes", "collision"))
     pose = checked_pose(pose_in_link, "pose_in_link")
     number = _client_number(client)
     mount = Mount(body, _find_link(number, body, link), pose)
@@ -142,7 +137,7 @@ def attach(
         image = Image.of(other, simulator.design)
         sensor = PybulletDepthSensor(number, mount, simulator, rules, image)
     else:
-        sensor = PybulletSensor(ClientSource(number, rules, shapes), mount, simulator)
+        sensor = PybulletSensor(ClientSource(number, rules), mount, simulator)
         sensor.contact_forces = bool(other.get("contact_forces", True))
     sensor.use_readout(sensor.readout if readout is None else readout)
     sensor.warn()
@@ -187,14 +182,13 @@ def attach_skin(
     """
     require_package("pybullet", "PyBullet", "pybullet")
     rules, other = split_rules(options, PybulletSkinOptions)
-    shapes = _checked_shapes(other.get("shapes", "collision"))
     number = _client_number(client)
     places: dict[str, Mount] = {}
     for name, mount in mounts.items():
         if not (isinstance(mount, tuple) and len(mount) == 2 and isinstance(mount[1], Pose)):
             raise SceneError(f"mount {name!r} is {mount!r}; give a pair (link, Pose(…))")
         places[name] = Mount(body, _find_link(number, body, mount[0]), mount[1])
-    source = ClientSource(number, rules, shapes)
+    source = ClientSource(number, rules)
     simulators = simulators_of(places, design)
     sensors = {k: PybulletSensor(source, mount, simulators[k]) for k, mount in places.items()}
     for sensor in sensors.values():
@@ -238,9 +232,9 @@ def attach_layout(
     require_package("pybullet", "PyBullet", "pybullet")
     import pybullet as p
 
-    rules, other = split_rules(options, PybulletSkinOptions)
+    rules, _ = split_rules(options, PybulletSkinOptions)
     number = _client_number(client)
-    source = ClientSource(number, rules, _checked_shapes(other.get("shapes", "collision")))
+    source = ClientSource(number, rules)
     at = _find_link(number, body, link)
     inertial = p.getDynamicsInfo(body, at, physicsClientId=number)[3:5]
     clear = clear_of_neighbours(layout, source, source.index(body, at), Pose(*inertial).inverse())
@@ -352,12 +346,6 @@ class PybulletDepthSensor(DepthSensor):
             conducts = matter.is_conductor()
             self._eps_r[code] = np.inf if conducts else matter.eps_r
         return links
-
-
-def _checked_shapes(shapes: str) -> str:
-    if shapes not in ("collision", "visual"):
-        raise ValueError(f'shapes is {shapes!r}; choose "collision" or "visual"')
-    return shapes
 
 
 def _client_number(client: Any) -> int:

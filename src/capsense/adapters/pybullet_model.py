@@ -102,15 +102,13 @@ class ClientSource(WorldSource):
     Args:
         client: Number of the physics client.
         rules: What is seen, and what it is made of.
-        shapes: ``"collision"`` or ``"visual"``.
 
     Raises:
         SceneError: A pattern fits nothing.
     """
 
-    def __init__(self, client: int, rules: Rules, shapes: str) -> None:
+    def __init__(self, client: int, rules: Rules) -> None:
         self.client = client
-        self._shapes = shapes
         self._watch = BodyWatch(client)
         super().__init__(rules)
         check_patterns(rules, self._links)
@@ -239,32 +237,47 @@ class ClientSource(WorldSource):
                 "bounds (left out)"
             )
             return
-        if self._shapes == "visual":
-            to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
-            flat = lost = False
-            for entry in drawn:
-                if entry[2] == p.GEOM_PLANE:  # its normal is told of the collision shape only
-                    flat = True
-                    continue
-                if self._is_nothing(link, entry):
-                    continue
-                try:
-                    shape = self._visual(link, entry)
-                except UnusableShape as error:
-                    self._notes.append(f"{error} (its link's collision shapes are taken)")
-                    lost = True
-                    continue
-                flat = flat or shape is None
-                if shape is not None:
-                    yield shape, to_mass @ Pose(entry[5], entry[6])
-            if not (flat or lost):
-                return
         # entries 0 and 1 are sound in the first record of a link only
         data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
-        if self._shapes == "visual" and not data and flat:
-            self._notes.append(
-                f"{link.names[-1]!r} has a flat visual mesh and no collision shape (left out)"
-            )
+        preferred, seen = self.rules.shapes, False
+        if preferred == "collision":
+            for found in self._solid_shapes(link, data):
+                seen = True
+                yield found
+            if seen:
+                return
+        to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
+        more = preferred == "both"
+        for entry in drawn:
+            if entry[2] == p.GEOM_PLANE:  # its normal is told of the collision shape only
+                more = True
+                continue
+            if self._is_nothing(link, entry):
+                continue
+            try:
+                shape = self._visual(link, entry)
+            except UnusableShape as error:
+                taken = bool(data) and preferred != "collision"
+                instead = "its link's collision shapes are taken" if taken else "left out"
+                self._notes.append(f"{error} ({instead})")
+                more = True
+                continue
+            if shape is not None:
+                seen = True
+                yield shape, to_mass @ Pose(entry[5], entry[6])
+                continue
+            more = True
+            if not data:
+                self._notes.append(
+                    f"{link.names[-1]!r} has a flat visual mesh and no collision shape (left out)"
+                )
+        if preferred != "collision" and (more or not seen):
+            yield from self._solid_shapes(link, data)
+
+    def _solid_shapes(
+        self, link: Link, data: Sequence[Any]
+    ) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
+        """What a link collides with, from the entries that PyBullet has of it."""
         for number, entry in enumerate(data):
             if self._is_nothing(link, entry):
                 continue

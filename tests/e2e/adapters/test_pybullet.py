@@ -115,6 +115,23 @@ def test_a_urdf_stands_where_its_file_says(
     assert (fore.radius, fore.length) == approx((0.008, 0.02), rel=1e-5)
 
 
+def test_a_link_that_is_only_drawn_is_seen(client: int, attach: Callable[..., Any]) -> None:
+    """Also one that only collides, where what is drawn is preferred; and both, if asked."""
+    make = {"radius": 0.01, "physicsClientId": client}
+    drawn = p.createVisualShape(p.GEOM_SPHERE, **make)
+    solid = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.01] * 3, physicsClientId=client)
+    p.createMultiBody(0, -1, drawn, AHEAD, physicsClientId=client)
+    for shapes in ("collision", "visual", "both"):
+        (ball,) = attach(shapes=shapes, exclude=["pad"]).scene()
+        same(ball.shape, cs.Sphere(0.01))
+    p.createMultiBody(0, solid, drawn, (0.03, 0, 0.04), physicsClientId=client)
+    assert [b.shape.kind.name for b in attach(exclude=["pad"]).scene()] == ["SPHERE", "BOX"]
+    kinds = [b.shape.kind.name for b in attach(shapes="both", exclude=["pad"]).scene()]
+    assert kinds == ["SPHERE", "SPHERE", "BOX"]
+    with pytest.raises(ValueError, match="shapes is .hull.; choose"):
+        attach(shapes="hull")
+
+
 def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
     """All shapes of a compound are seen, each in its place."""
     array = p.createCollisionShapeArray(
@@ -319,7 +336,7 @@ def test_shapes_without_volume_are_left_out(
     shape = {"radius": 0.01, "physicsClientId": client}
     ball = (f(p.GEOM_SPHERE, **shape) for f in (p.createCollisionShape, p.createVisualShape))
     p.createMultiBody(0, *ball, basePosition=AHEAD, physicsClientId=client)
-    with pytest.warns(UserWarning, match=r"sensor: 'robot/robot_link' .*\(left out\)$"):
+    with pytest.warns(UserWarning, match=r"sensor: 'robot/robot_link' (.|\n)*\(left out\)$"):
         sensor = attach(shapes=shapes)
     (body,) = sensor.scene()
     assert body.shape == cs.Sphere(0.01)
