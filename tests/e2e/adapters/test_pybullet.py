@@ -128,7 +128,7 @@ def test_a_link_that_is_only_drawn_is_seen(client: int, attach: Callable[..., An
     assert [b.shape.kind.name for b in attach(exclude=["pad"]).scene()] == ["SPHERE", "BOX"]
     kinds = [b.shape.kind.name for b in attach(shapes="both", exclude=["pad"]).scene()]
     assert kinds == ["SPHERE", "SPHERE", "BOX"]
-    with pytest.raises(ValueError, match="shapes is .hull.; choose"):
+    with pytest.raises(ValueError, match="shapes is 'hull'; choose"):
         attach(shapes="hull")
 
 

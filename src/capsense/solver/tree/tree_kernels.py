@@ -253,7 +253,7 @@ def table_of_functions(block, children, panel, charge, function):
     """Integrate a symmetric table of panel values with every charge function, both ways.
 
     Args:
-        block: Mean values between panels, shape (n, n); lost.
+        block: Mean values between panels, shape (n, n).
         children, panel, charge, function: As in :func:`to_functions`.
 
     Returns:
@@ -267,10 +267,7 @@ def table_of_functions(block, children, panel, charge, function):
             for i in range(start, min(start + _BLOCK, n)):
                 for j in range(low, min(low + _BLOCK, i)):
                     rows[i, j], rows[j, i] = rows[j, i], rows[i, j]
-    to_functions(rows, children, panel, charge, function, block)
-    for i in range(n):
-        for j in range(i + 1):
-            out[i, j] = block[i, j]
+    to_functions(rows, children, panel, charge, function, out)
     mirror(out)
     return out
 
