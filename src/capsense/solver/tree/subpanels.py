@@ -162,6 +162,14 @@ def halved(whole: Array, finest: float) -> tuple[Array, Ints, Ints]:
     return corners[:count], children[:count], panel[:count]
 
 
+@kernel
+def _double(corners: Array, q: int) -> float:
+    """Twice the area of the triangle of corners 0, q and q + 1 of a polygon [m²], (4, 2)."""
+    x, y = corners[0]
+    ax, ay = corners[q, 0] - x, corners[q, 1] - y
+    return ax * (corners[q + 1, 1] - y) - ay * (corners[q + 1, 0] - x)
+
+
 @compiled
 def _four_points(
     corners: Array, panel: Ints, axes: Array, middles: Array, area: Array, extent: Array,
@@ -181,19 +189,19 @@ def _four_points(
     for k in range(corners.shape[0]):
         x0, y0 = corners[k, 0, 0], corners[k, 0, 1]
         total = x = y = xx = yy = xy = 0.0
-        for q in range(1, 3):  # triangles with a corner at the first one
+        for q in range(1, 3):
+            total += _double(corners[k], q)
+        for q in range(1, 3):
             ax, ay = corners[k, q, 0] - x0, corners[k, q, 1] - y0
             bx, by = corners[k, q + 1, 0] - x0, corners[k, q + 1, 1] - y0
-            double = ax * by - ay * bx
-            total += double
-            x += double * (ax + bx) / 3
-            y += double * (ay + by) / 3
-            sx, sy = ax + bx, ay + by
-            xx += double / 12 * (ax * ax + bx * bx + sx * sx)
-            yy += double / 12 * (ay * ay + by * by + sy * sy)
-            xy += double / 12 * (ax * ay + bx * by + sx * sy)
-        x, y = x / total, y / total
-        xx, yy, xy = xx / total - x * x, yy / total - y * y, xy / total - x * y
+            part, sx, sy = _double(corners[k], q) / total, ax + bx, ay + by
+            x += part * sx / 3
+            y += part * sy / 3
+            for u, v in ((ax, ay), (bx, by), (sx, sy)):
+                xx += part / 12 * (u * u)
+                yy += part / 12 * (v * v)
+                xy += part / 12 * (u * v)
+        xx, yy, xy = xx - x * x, yy - y * y, xy - x * y
         turn, spread = 0.5 * math.atan2(2 * xy, xx - yy), math.hypot(0.5 * (xx - yy), xy)
         long = math.sqrt(0.5 * (xx + yy) + spread)
         short = math.sqrt(max(0.5 * (xx + yy) - spread, 0.0))
