@@ -329,6 +329,13 @@ class ModelSource(WorldSource):
         root = self.model.body_rootid
         return set(np.flatnonzero(root == root[frame]).tolist())
 
+    def neighbours(self, frame: int) -> set[int]:
+        m = self.model
+        weld, root = m.body_weldid, m.body_rootid == m.body_rootid[frame]
+        above = weld[m.body_parentid[weld]]  # what the joints of each body are on
+        near = (weld == weld[frame]) | (above == weld[frame]) | (weld == above[frame])
+        return set(np.flatnonzero(near & root).tolist())
+
     def soft(self, own: int | None) -> list[SoftSolid]:
         soft = [self.reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
         return [s for s in soft if s is not None]

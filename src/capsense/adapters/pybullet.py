@@ -29,7 +29,7 @@ from capsense.adapters.rules import (
     check_perception,
     split_rules,
 )
-from capsense.adapters.skin import AttachedSkin, clear_of_neighbours, simulators_of
+from capsense.adapters.skin import AttachedSkin, Progress, clear_of_neighbours, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, require_package
@@ -152,6 +152,7 @@ def attach_skin(
     *,
     readout: Readout | str | Path | None = None,
     threads: int | None = None,
+    progress: Progress | None = None,
     **options: Unpack[PybulletSkinOptions],
 ) -> AttachedSkin:
     """Attach several sensors to a robot's links; one ``read()`` reads them all, in parallel.
@@ -169,6 +170,8 @@ def attach_skin(
             :meth:`~capsense.adapters.skin.AttachedSkin.use_readout`; by default that of the
             simulator, if one is given.
         threads: How many threads read; by default as many as the process may use processors.
+        progress: Called with a stage's name and the fraction done. What is worked out is kept, also
+            if it is interrupted.
         options: As for :func:`attach`: those of :class:`PybulletSkinOptions`.
 
     Raises:
@@ -189,12 +192,12 @@ def attach_skin(
             raise SceneError(f"mount {name!r} is {mount!r}; give a pair (link, Pose(…))")
         places[name] = Mount(body, _find_link(number, body, mount[0]), mount[1])
     source = ClientSource(number, rules)
-    simulators = simulators_of(places, design)
+    simulators = simulators_of(places, design, progress)
     sensors = {k: PybulletSensor(source, mount, simulators[k]) for k, mount in places.items()}
     for sensor in sensors.values():
         sensor.contact_forces = bool(other.get("contact_forces", True))
     skin = AttachedSkin(sensors, readout, threads)
-    skin.warn()
+    skin.warn(progress)
     return skin
 
 
@@ -206,6 +209,7 @@ def attach_layout(
     *,
     readout: Readout | str | Path | None = None,
     threads: int | None = None,
+    progress: Progress | None = None,
     **options: Unpack[PybulletSkinOptions],
 ) -> AttachedSkin:
     """Attach the patches of a layout to a link; one ``read()`` reads them all.
@@ -219,6 +223,7 @@ def attach_layout(
         layout: What ``cs.skin.from_mesh``, ``from_taxels`` or ``paint`` returns.
         readout: As of :func:`attach_skin`.
         threads: As of :func:`attach_skin`.
+        progress: As of :func:`attach_skin`.
         options: As of :func:`attach_skin`.
 
     Raises:
@@ -240,8 +245,9 @@ def attach_layout(
     clear = clear_of_neighbours(layout, source, source.index(body, at), Pose(*inertial).inverse())
     mounts = {name: (at, pose) for name, (_, pose) in clear.items()}
     return attach_skin(
-        client, body, mounts, clear.designs, readout=readout, threads=threads, **options
-    )
+        client, body, mounts, clear.designs, readout=readout, threads=threads,
+        progress=progress, **options,
+    )  # fmt: skip
 
 
 class PybulletSensor(GeometrySensor):

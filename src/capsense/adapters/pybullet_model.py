@@ -172,6 +172,25 @@ class ClientSource(WorldSource):
         body = self._links[frame].body
         return {number for number, link in enumerate(self._links) if link.body == body}
 
+    def neighbours(self, frame: int) -> set[int]:
+        import pybullet as p
+
+        body = self._links[frame].body
+        numbers = sorted(self.robot(frame))  # the base and the links, in order
+        joints = [p.getJointInfo(body, k, self.client) for k in range(len(numbers) - 1)]
+        weld = list(range(len(numbers)))  # the first of what is fixed together
+        above = [-1] * len(numbers)
+        for k, joint in enumerate(joints, start=1):  # a parent comes before its children
+            parent = weld[joint[16] + 1]
+            weld[k] = parent if joint[2] == p.JOINT_FIXED else k
+            above[k] = above[parent] if joint[2] == p.JOINT_FIXED else parent
+        own = numbers.index(frame)
+        return {
+            number
+            for k, number in enumerate(numbers)
+            if weld[k] == weld[own] or weld[own] == above[k] or weld[k] == above[own]
+        }
+
     def soft(self, own: int | None) -> list[SoftSolid]:
         numbers = [i for i, k in enumerate(self._links) if i != own and is_soft(self.client, k)]
         return [soft for i in numbers for soft in self._soft_of(i)]
