@@ -18,7 +18,7 @@ from capsense.design.model import Domain
 from capsense.errors import SceneError, listed
 from capsense.reading import Reading
 from capsense.readout import Readout
-from capsense.scene import Pose
+from capsense.scene import Pose, Scene
 from capsense.simulator import Simulator
 from capsense.skin import (
     AnyDesign,
@@ -63,7 +63,19 @@ class AttachedSkin:
         else:
             self.use_readout(readout)
 
-    def read(self, time: float | None = None) -> dict[str, Reading]:
+    def views(self) -> dict[str, Scene]:
+        """What each sensor sees at the present state, by name, in its own frame.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+        """
+        with self._one:
+            links = self._source.links()
+            return {name: sensor.scene(links) for name, sensor in self.sensors.items()}
+
+    def read(
+        self, time: float | None = None, views: Mapping[str, Scene] | None = None
+    ) -> dict[str, Reading]:
         """The readings of the simulator's present state, by name.
 
         They are those that the sensors would give one by one, to the last bit.
@@ -71,6 +83,7 @@ class AttachedSkin:
         Args:
             time: Time of the state [s], for readouts; by default the simulator's own, where it
                 tells it.
+            views: What :meth:`views` has just given, if that was asked already.
 
         Raises:
             SkinError: Some sensors failed; it holds the readings of the others.
@@ -78,13 +91,13 @@ class AttachedSkin:
         """
 
         with self._one:
-            links = self._source.links()
+            links = self._source.links() if views is None else None
             for sensor in self.sensors.values():
                 sensor.catch_up()
             return read_all(
                 self._pool,
                 {name: sensor.simulator for name, sensor in self.sensors.items()},
-                lambda name: self.sensors[name].scene(links),
+                lambda name: self.sensors[name].scene(links) if views is None else views[name],
                 lambda name: self.sensors[name].time_of(time),
                 lambda name, reading: self.sensors[name].sampled(reading, time),
             )

@@ -370,7 +370,9 @@ def test_mounting_is_told_apart_from_the_scene(tiny_simulator: cs.Simulator) -> 
     found = sensor.check()
     (link,), (ball,) = found.mounting, found.scene
     assert re.match(r".*inside 'two/two', up to 5 mm deep.*move the sensor's frame", link)
-    assert re.match(r".*inside 'ball/ball', up to [89]\.\d mm deep.*until they part; move one of", ball)
+    assert re.match(
+        r".*inside 'ball/ball', up to [89]\.\d mm deep.*until they part; move one of", ball
+    )
     assert list(found) == [link, ball]
     assert str(found) == f"mounting: {link};\nscene: {ball}"
     assert sensor.source.neighbours(1) == {1, 2}
@@ -422,7 +424,9 @@ def test_findings_of_many_sensors_are_one_sentence(tiny_simulator: cs.Simulator)
     mujoco.mj_forward(model, data)
     found = skin.check()
     (text,) = found.scene
-    assert re.match(r"2 of 2 sensors, 'high', 'pad'; the worst, 'high': electrodes .* 7\.9 mm", text)
+    assert re.match(
+        r"2 of 2 sensors, 'high', 'pad'; the worst, 'high': electrodes .* 7\.9 mm", text
+    )
     assert found.mounting == []
     assert str(found) == f"scene: {text}"
     assert pickle.loads(pickle.dumps(found)) == found
