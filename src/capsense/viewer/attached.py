@@ -29,7 +29,26 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-class SensorStream(Stream):
+class _Fed(Stream):
+    """Instants that are put in.
+
+    Args:
+        simulator: Potentials come from it.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        super().__init__(simulator)
+        self.frames: queue.Queue[Frame] = queue.Queue()
+        """Where they are put in."""
+
+    def next(self, timeout: float) -> Frame | None:
+        try:
+            return self.frames.get(timeout=timeout)
+        except queue.Empty:
+            return None
+
+
+class SensorStream(_Fed):
     """What a sensor reads, as it is put in.
 
     Args:
@@ -40,13 +59,6 @@ class SensorStream(Stream):
         super().__init__(sensor.simulator.copy())
         self.title, self.empty = f"{self.design.name}, on a robot", sensor.simulator.empty
         self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
-        self.frames: queue.Queue[Frame] = queue.Queue()
-
-    def next(self, timeout: float) -> Frame | None:
-        try:
-            return self.frames.get(timeout=timeout)
-        except queue.Empty:
-            return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +79,7 @@ class SkinReading:
         return np.diag(self.self_capacitance)
 
 
-class SkinStream(Stream):
+class SkinStream(_Fed):
     """What a skin reads, as it is put in.
 
     Args:
@@ -82,7 +94,6 @@ class SkinStream(Stream):
         self.title = f"skin of {len(simulators)} sensors"
         self.channels = channels_of(Excitation.SELF, list(simulators))
         self.empty = self.reading({name: np.zeros(1) for name in simulators}, StepStats(0.0, 0.0))
-        self.frames: queue.Queue[Frame] = queue.Queue()
 
     def reading(self, changes: Mapping[str, Array], stats: StepStats) -> Reading:
         """What charts show of changes of electrodes' own capacitances [F]."""
@@ -93,12 +104,6 @@ class SkinStream(Stream):
         from capsense.viewer.scene_drawing import SkinDrawing
 
         return SkinDrawing(server, self._designs, self._middles)
-
-    def next(self, timeout: float) -> Frame | None:
-        try:
-            return self.frames.get(timeout=timeout)
-        except queue.Empty:
-            return None
 
 
 class _Page:
