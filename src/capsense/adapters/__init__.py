@@ -37,6 +37,9 @@ from capsense.simulator import Simulator
 
 Array = NDArray[np.float64]
 
+_OUT = 1e-3
+"""A sensor has its link at its back where the middle of that is so far behind it [m]."""
+
 
 class AttachedSensor(ABC):
     """Reads a sensor that rides on a link of a simulated robot.
@@ -371,17 +374,22 @@ class GeometrySensor(AttachedSensor):
             for name in map(str, self.world.names({contact.frame})):
                 pressed[name] = max(pressed.get(name, 0.0), -contact.gap)
         found = felt(simulator, scene, placement(scene, simulator, near, pressed))
-        hidden = buried(self._link(frames), self._design)
+        link = self._link(frames)
+        hidden = buried(link, self._design)
         if not blind(found):
             return Findings(found + hidden)
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
         own = self.world.names(self.source.robot(self._carrier))
         others = [str(b.name) for b in behind if b.name not in own]
-        if others:
+        middles = [b.pose.apply(b.shape.bounds().mean(axis=0))[2] for b in link]
+        outwards = bool(middles) and float(np.mean(middles)) < -_OUT
+        if others and not outwards:
             return Findings([turned_round(others), *hidden])
-        link = self._own_frame()
-        away = 0.0 if link is None else math.dist(frames.position[link], frames.sensor_position)
+        own_frame = self._own_frame()
+        away = 0.0
+        if own_frame is not None:
+            away = math.dist(frames.position[own_frame], frames.sensor_position)
         return Findings([*([far_off(away)] if away > FAR else found), *hidden])
 
     def _link(self, frames: Frames) -> Scene:

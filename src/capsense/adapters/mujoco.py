@@ -14,6 +14,7 @@ from capsense.adapters import GeometrySensor, make_simulator, refuse_missing
 from capsense.adapters.findings import Finding, Findings
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
+from capsense.adapters.placement import markers
 from capsense.adapters.rules import AttachOptions, Image, Rules, check_perception, split_rules
 from capsense.adapters.skin import AttachedSkin, Progress, clear_of_neighbours, simulators_of
 from capsense.adapters.world import Frames
@@ -300,16 +301,10 @@ def _markers(source: ModelSource, own: int, near: Sequence[int]) -> list[Finding
         if g in near and clear[g] and not collide[g] and m.geom_bodyid[g] != own
         and not source.reader.excludes(g)
     ]  # fmt: skip
-    if not found:
-        return []
     names = [source.reader.name(g) for g in found]
     bodies = list(dict.fromkeys(name.partition("/")[0] for name in names))
     exclude = names if "world" in bodies else bodies
-    text = (
-        f"{listed(names, 4)} can be seen through and collide with nothing, as markers do, but are "
-        f"read as bodies; leave out what is none with exclude={exclude[:6]}"
-    )
-    return [Finding(text, "markers", mounting=True, severity=len(found))]
+    return markers(names, exclude)
 
 
 def _twins(source: ModelSource, geom: int, among: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -139,6 +139,22 @@ def nothing_seen(design: Design) -> Finding:
     return Finding(text, BLIND)
 
 
+def markers(names: list[str], exclude: list[str]) -> list[Finding]:
+    """The finding for shapes that look like markers: see-through, and nothing hits them.
+
+    Args:
+        names: What they are called.
+        exclude: Patterns that leave them out.
+    """
+    if not names:
+        return []
+    text = (
+        f"{listed(names, 4)} can be seen through and collide with nothing, as markers do, but are "
+        f"read as bodies; leave out what is none with exclude={exclude[:6]}"
+    )
+    return [Finding(text, "markers", mounting=True, severity=len(names))]
+
+
 def far_off(away: float) -> Finding:
     """The finding for a sensor that sees nothing and stands far from what carries it.
 

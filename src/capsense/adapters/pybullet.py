@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters import DepthSensor, GeometrySensor, make_simulator, refuse_missing
+from capsense.adapters.findings import Findings
+from capsense.adapters.placement import markers
 from capsense.adapters.pybullet_bodies import (
     BodyWatch,
     Link,
@@ -262,6 +264,11 @@ class PybulletSensor(GeometrySensor):
         """The body that carries the sensor, and its link, -1 for the base."""
         self._in_link = mount.pose_in_link
         super().__init__(simulator, source)
+
+    def check(self) -> Findings:
+        seen = self.world.names(self.source.clear)
+        names = [str(body.name) for body in self.scene() if body.name in seen]
+        return Findings([*super().check(), *markers(names, names)])
 
     def _take_over(self) -> None:
         import pybullet as p

@@ -124,6 +124,8 @@ class ClientSource(WorldSource):
         self._meshes: dict[tuple[object, ...], Shape] = {}
         self._notes: list[str] = []  # what was left out or replaced, and why
         self._made: dict[int, list[Solid]] = {}
+        self.clear: set[int] = set()
+        """Links that are only drawn, and can be seen through."""
 
     def index(self, body: int, link: int) -> int:
         """Number of a link's frame.
@@ -220,7 +222,7 @@ class ClientSource(WorldSource):
         if self.rules.excludes(link.names):
             return
         material, tie = matter_of(self.client, link, self.rules)
-        for shape, pose in self._shapes_of(link):
+        for shape, pose in self._shapes_of(index):
             yield Solid(
                 label=link.names[-1],
                 shape=shape,
@@ -243,10 +245,11 @@ class ClientSource(WorldSource):
         material, tie = matter_of(self.client, link, self.rules)
         return [SoftSolid(link.names[-1], mesh.faces, mesh.vertices, material, tie)]
 
-    def _shapes_of(self, link: Link) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
-        """Shapes, and their poses in the frame of the link's centre of mass."""
+    def _shapes_of(self, index: int) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
+        """Shapes of a link, and their poses in the frame of its centre of mass."""
         import pybullet as p
 
+        link = self._links[index]
         dynamics = p.getDynamicsInfo(link.body, link.link, physicsClientId=self.client)
         drawn = p.getVisualShapeData(link.body, physicsClientId=self.client)
         drawn = [entry for entry in drawn if entry[1] == link.link]
@@ -265,6 +268,8 @@ class ClientSource(WorldSource):
                 yield found
             if seen:
                 return
+        if not data and any(entry[7][3] < 1 for entry in drawn):
+            self.clear.add(index)
         to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
         more = preferred == "both"
         for entry in drawn:

@@ -159,6 +159,43 @@ def test_markers_are_told(tiny_simulator: cs.Simulator) -> None:
     assert not any("markers" in text for text in clean.check())
 
 
+def test_markers_in_pybullet(tiny_simulator: cs.Simulator) -> None:
+    """A goal that is only drawn, and can be seen through; another one that cannot."""
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    client = p.connect(p.DIRECT)
+    pad = p.createMultiBody(0, physicsClientId=client)
+    for alpha, place in ((0.3, (0, 0, 0.05)), (1.0, (0.03, 0, 0.05))):
+        ball = p.createVisualShape(
+            p.GEOM_SPHERE, radius=0.01, rgbaColor=(1, 0, 0, alpha), physicsClientId=client
+        )
+        p.createMultiBody(0, -1, ball, place, physicsClientId=client)
+    with pytest.warns(UserWarning, match="as markers do"):
+        sensor = cs.pybullet.attach(client, pad, -1, cs.Pose(), tiny_simulator)
+    (found,) = sensor.check().mounting
+    assert re.match(r"'body1/\w*' can be seen through .* with exclude=\['body1/\w*'\]$", found)
+    assert len(sensor.scene()) == 2
+    p.disconnect(client)
+
+
+def test_a_sensor_that_faces_out_of_its_link_is_not_turned_round(
+    tiny_simulator: cs.Simulator,
+) -> None:
+    """On the far side of an arm: there is something on the other side of the arm only."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><geom type="box" size=".02 .02 .01"/>'
+        '<site name="out" pos="0 0 .011"/><site name="in" pos="0 0 .011" quat="0 1 0 0"/></body>'
+        '<body pos="0 0 -.03"><geom name="ball" size=".01"/></body>'
+        '<body pos="0 0 .05"><geom name="other" size=".01"/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for site, exclude, told in (("out", ["other"], False), ("in", ["ball"], True)):
+        found = cs.mujoco.attach(model, data, site, tiny_simulator, exclude=exclude).check()
+        assert len(found) == 1
+        assert ("faced the other way" in found[0]) == told == bool(found.mounting)
+
+
 @pytest.mark.parametrize(("height", "told"), [(0.05, False), (0.041, False), (0.02, True)])
 def test_electrodes_within_their_own_link(
     height: float, told: bool, tiny_simulator: cs.Simulator
