@@ -384,8 +384,8 @@ class GeometrySensor(AttachedSensor):
         others = [str(b.name) for b in behind if b.name not in own]
         middles = [b.pose.apply(b.shape.bounds().mean(axis=0))[2] for b in link]
         outwards = bool(middles) and float(np.mean(middles)) < -_OUT
-        if others and not outwards:
-            return Findings([turned_round(others), *hidden])
+        if others:
+            return Findings([turned_round(others, mounting=not outwards), *hidden])
         own_frame = self._own_frame()
         away = 0.0
         if own_frame is not None:

@@ -169,14 +169,19 @@ def far_off(away: float) -> Finding:
     return Finding(text, BLIND, mounting=True, severity=away)
 
 
-def turned_round(names: list[str]) -> Finding:
-    """The finding for a sensor that has everything at its back."""
+def turned_round(names: list[str], *, mounting: bool) -> Finding:
+    """The finding for a sensor that has everything at its back.
+
+    Args:
+        names: What stands there.
+        mounting: Whether it is mounted wrongly, or may just face out of its link on the far side.
+    """
     text = (
         f"{_NOTHING}, but {listed(names, 4)} would be if the sensor faced the other way: its z "
         "must point out of the sensor; if it should see that, turn its frame half round about x "
         '(quaternion (1, 0, 0, 0), in MJCF euler="180 0 0")'
     )
-    return Finding(text, BLIND, mounting=True)
+    return Finding(text, BLIND, mounting=mounting)
 
 
 def _contacts(
