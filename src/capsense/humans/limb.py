@@ -20,7 +20,7 @@ from capsense.humans.chain import Chain, Joint, LimbPart, Segment
 from capsense.humans.fingers import hand_segments
 from capsense.humans.formats import to_mjcf, to_urdf
 from capsense.scene import Body, Material, Pose
-from capsense.scene.materials import Grounding, checked_grounding
+from capsense.scene.materials import Grounding
 from capsense.scene.pose import checked_pose
 
 Side = Literal["left", "right"]
@@ -50,18 +50,22 @@ class Limb(Chain):
             material: What it is made of.
             grounding: ``"grounded"``, ``"floating"``, or the capacitance [F] that ties the
                 whole person to ground, :func:`~capsense.humans.capacitance_to_ground` say. The
-                bodies share it; as they touch, they are one conductor on all of it.
+                bodies are one conductor of the limb's name.
 
         Raises:
             SceneError: A joint, an angle, the material or the grounding is wrong.
         """
         checked_pose(pose)
-        tie = checked_grounding(grounding)
-        if not isinstance(tie, str):
-            tie /= sum(len(s.parts) for s in self.segments)
         where = {n: pose @ at for n, at in self.forward(angles, degrees=degrees).items()}
         return [
-            Body(part.shape, where[segment.name] @ part.pose, material, tie, name)
+            Body(
+                part.shape,
+                where[segment.name] @ part.pose,
+                material,
+                grounding,
+                name,
+                conductor=self.name,
+            )
             for segment in self.segments
             for name, part in self.named_parts(segment)
         ]

@@ -241,7 +241,9 @@ class Show(_Page):
 
     def _around(self) -> tuple[tuple[Shape, Pose], ...]:
         """All solids of the simulator, the robot's own too, in the sensor frame at present."""
-        return () if self._solids is None else self._solids.now(self._sensor.pose.inverse())
+        if self._solids is None or isinstance(self._sensor, Simulator):
+            return ()
+        return self._solids.now(self._sensor.pose.inverse())
 
 
 class SkinShow(_Page):

@@ -290,6 +290,8 @@ def _labels(bodies: Sequence[Body]) -> dict[int, str]:
         if label is not None and (body.conductor is None or first.setdefault(label, k) == k):
             found[k] = label
     return found
+
+
 class SkinDrawing:
     """Draws all sensors of a skin; lengths are metres in the frame of the world.
 

@@ -92,6 +92,8 @@ def test_a_simulator_by_itself() -> None:
         assert any(name.startswith("/bodies/") for name in nodes_of(page.view.server))
         with pytest.raises(TypeError, match="call step"):
             page.read()
+
+
 SKIN = """<mujoco><worldbody>
 <body name="arm" pos="0 0 .3"><joint type="slide" axis="1 0 0"/>
 <geom type="box" size=".06 .05 .005"/><site name="top" pos="0 0 .006"/>

@@ -223,12 +223,10 @@ def test_wrong_angles_are_refused() -> None:
 
 
 def test_a_person_is_tied_to_ground_once() -> None:
-    """The bodies of a limb share the capacitance."""
-    bodies = arm().bodies(grounding=100e-12)
-    assert sum(b.grounding for b in bodies) == approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
-    assert {b.grounding for b in arm().bodies(grounding="floating")} == {"floating"}
-    shared = arm().bodies(grounding=Ties(100e-12, 20e-12))
-    assert sum(b.grounding.local for b in shared) == approx(20e-12, rel=1e-9, abs=0)  # type: ignore[union-attr, misc]
+    """The bodies of a limb are one conductor of its name, on the whole capacitance."""
+    for tie in (100e-12, "floating", Ties(100e-12, 20e-12)):
+        found = {(b.grounding, b.conductor) for b in arm().bodies(grounding=tie)}
+        assert found == {(tie, "right_arm")}
     with pytest.raises(SceneError, match=r"which a MuJoCo model cannot say.*attach"):
         arm().mjcf(grounding=Ties(100e-12, 20e-12))
     assert {b.material.name for b in arm().bodies(material="skin")} == {"skin"}
@@ -300,7 +298,7 @@ def test_urdf_stands_as_the_limb_does(limb: Limb, tmp_path: Path) -> None:
 
 
 def test_an_attached_sensor_knows_a_limb(simulators: Any) -> None:
-    """The texts of the MJCF carry over: human, 100 pF in all."""
+    """The texts of the MJCF carry over: human, one conductor on 100 pF."""
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
     model = mujoco.MjSpec.from_string(arm().mjcf(cs.Pose((0, 0, 0.1))))
     model.worldbody.add_site(name="pad", pos=(0.0, 0.1, -0.1), quat=(0.7071, 0.7071, 0, 0))
@@ -310,7 +308,8 @@ def test_an_attached_sensor_knows_a_limb(simulators: Any) -> None:
     scene = cs.mujoco.attach(compiled, data, "pad", simulators("six_patch_bare")).scene()
     assert len(scene) > 2
     assert {b.material.name for b in scene} == {"human"}
-    assert sum(b.grounding for b in scene) == approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
+    assert {b.grounding for b in scene} == {100e-12}
+    assert len({b.conductor for b in scene}) == 1
 
 
 # -- meshes --------------------------------------------------------------------------------------
