@@ -30,7 +30,8 @@ def random_angles(limb: Limb, seed: int) -> dict[str, float]:
 
 
 def conductors(bodies: list[cs.Body]) -> int:
-    """How many conductors bodies are, by what touches what."""
+    """How many conductors bodies are, by what touches what, whatever their names."""
+    bodies = [cs.Body(b.shape, b.pose, b.material, "floating") for b in bodies]
     scene = cs.Scene(bodies)
     joined = matter_of(bodies, 250e3).joined(scene, scene.pack(), np.arange(len(bodies)))
     return len(set(joined.group.tolist()))

@@ -216,18 +216,17 @@ def test_a_person_is_one_conductor(build: Build, hands: Any) -> None:
     rng = np.random.default_rng(6)
     anyhow = [{j.name: float(rng.uniform(j.lower, j.upper)) for j in limb.joints} for _ in range(3)]
     for angles in (*POSTURES.values(), *anyhow):
-        bodies = limb.bodies(angles=angles, grounding="floating")
+        named = limb.bodies(angles=angles, grounding="floating")
+        bodies = [cs.Body(b.shape, b.pose, b.material, "floating") for b in named]
         scene = cs.Scene(bodies)
         joined = matter_of(bodies, 250e3).joined(scene, scene.pack(), np.arange(len(bodies)))
         assert len(set(joined.group.tolist())) == 1
 
 
-@pytest.mark.parametrize("grounding", [20e-12, "floating"])
-def test_parts_outside_the_domain_carry_charge(
-    grounding: Any, simulators: Callable[..., cs.Simulator]
-) -> None:
-    """A person reads as what is in the domain does on the whole capacitance; cut in two, a capsule
-    of it reads the same."""
+def test_parts_outside_the_domain_tie_a_person(simulators: Callable[..., cs.Simulator]) -> None:
+    """A person on 100 pF reads as what is in the domain does; one that floats is tied by the
+    capacitance of the rest in free space, some 40 pF; cut in two, a capsule reads the same."""
+    grounding = 100e-12
     simulator = simulators("six_patch_bare")
     bodies = over_a_sensor(person(hands="detailed"), 0.05, grounding)
     scene = cs.Scene(bodies)
@@ -244,8 +243,12 @@ def test_parts_outside_the_domain_carry_charge(
 
     alone = simulator.step(cs.Scene(tied(seen))).delta
     assert np.abs(alone - whole).max() < 1e-9 * np.abs(whole).max()
-    earthed = cs.Scene([cs.Body(b.shape, b.pose, b.material) for b in seen])
-    assert np.abs(simulator.step(earthed).delta - whole).max() > 0.05 * np.abs(whole).max()
+    floats = [cs.Body(b.shape, b.pose, b.material, "floating", conductor="p") for b in bodies]
+    lone = [cs.Body(b.shape, b.pose, b.material, 40e-12, conductor="p") for b in seen]
+    on_rest, on_40 = (simulator.step(cs.Scene(parts)).delta for parts in (floats, lone))
+    assert np.abs(on_rest - on_40).max() < 0.01 * np.abs(whole).max()
+    alone = simulator.step(cs.Scene([b for b in floats if b.pose in {s.pose for s in seen}])).delta
+    assert np.abs(on_rest - alone).max() > 0.05 * np.abs(whole).max()
     halves: list[cs.Body] = []
     for body in seen:
         if "index_proximal" in str(body.name):

@@ -35,7 +35,8 @@ def _outside(body, space, out):
     children, charge, center = (
         integers(body.children), doubles(body.charge), doubles(body.center),
     )  # fmt: skip
-    out[:] = 0.0
+    for i in range(4):
+        out[i] = 0.0
     r, p, s = body.rotation, body.position, body.scale
     for k in range(min(COARSE, 2 * body.n - 1)):
         if 0 <= children[2 * k] < COARSE - 1:  # its parts stand for it
@@ -51,7 +52,8 @@ def _outside(body, space, out):
         out[2] += share * v
         out[3] += share * w
     if out[0] > 0.0:
-        out[1:] /= out[0]
+        for i in range(1, 4):
+            out[i] /= out[0]
         out[0] *= s * body.capacitance / charge[0]
 
 
