@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from surface_twin import WALL_PENALTY, off_walls
+from surface_twin import barrier, off_walls
 
 from capsense.field.green_kernels import Green
 from capsense.solver.system.step import Solution
@@ -22,7 +22,7 @@ def jacobian(solution: Solution, bodies: Array, green: Green) -> Array:
         bodies: Records of the bodies, which turn about their positions, shape (b,).
         green: The Green's function.
     """
-    origins, free = bodies["position"], bodies["free"][solution.owner] != 0
+    origins, free = bodies["position"], bodies["free"][solution.owner]
     out = np.empty((len(origins), green.terminals, green.terminals, 6))
     for b, origin in enumerate(origins):
         own = solution.owner == b
@@ -63,8 +63,7 @@ def _energy(points: Array, free: Array, solution: Solution, green: Green) -> Arr
     other = solution.owner[:, None] != solution.owner
     far = _far(solution.points, solution.points, solution.extent)
     pairs += np.where(other, _means(points, points, far, solution.softening_length), 0.0)
-    soft = np.minimum(out**2 / np.maximum(1 - out, 1e-9), 1e4) / solution.extent
-    pairs += np.diag(WALL_PENALTY * held**3 + np.where(held < out, soft, 0.0))
+    pairs += np.diag(barrier(out, held, free, solution.extent))
     return phi.T @ charge + charge.T @ phi - charge.T @ pairs @ charge + modes.T @ modes
 
 

@@ -63,9 +63,12 @@ class Piece:
         return out
 
     @property
-    def free(self) -> bool:
-        """Whether it is a conductor that is not at ground."""
-        return not np.isfinite(self.eps_r) and (self.neutral or self.ground_elastance != 0.0)
+    def free(self) -> float:
+        """How little it is tied to ground, 0 to 1, in a domain of 0.5 m; 0 of no conductor."""
+        if np.isfinite(self.eps_r):
+            return 0.0
+        tie = abs(self.ground_elastance)
+        return 1.0 if self.neutral else tie * EXTENT / (1.0 + tie * EXTENT)
 
     @property
     def rotation(self) -> Array:
@@ -104,35 +107,41 @@ def galerkin(pieces: tuple[Piece, ...], green: GreenFunction, room: Array) -> Ar
     return phi.T @ x[: len(phi)]
 
 
-def off_walls(point: Array, room: Array, free: bool) -> tuple[float, float]:
+def off_walls(point: Array, room: Array, free: float) -> tuple[float, float]:
     """How far a point is in what bodies fade out in, 0 to 1, beyond all walls and the floor."""
-    off = np.maximum(np.stack([room[0] - point, point - room[1]]), 0.0) / WALL_FADE_LENGTH
-    if free:
-        inner = room + np.array([[35e-3, 35e-3, 0.0], [-35e-3, -35e-3, -35e-3]])
-        length = np.array([[40e-3, 40e-3, 5e-3], [40e-3, 40e-3, 40e-3]])
-        off = np.maximum(np.stack([inner[0] - point, point - inner[1]]), 0.0) / length
-    return float(np.linalg.norm(off)), off[0, 2] if free else float(np.linalg.norm(off))
+    inner = room + free * np.array([[35e-3, 35e-3, 0.0], [-35e-3, -35e-3, -35e-3]])
+    length = WALL_FADE_LENGTH + free * np.array([[35e-3, 35e-3, 0.0], [35e-3, 35e-3, 35e-3]])
+    off = np.maximum(np.stack([inner[0] - point, point - inner[1]]), 0.0) / length
+    return float(np.linalg.norm(off)), off[0, 2]
+
+
+def barrier(x: Array, held: Array, free: Array, extent: Array) -> Array:
+    """What keeps charge off: steep of what is at ground, soft of what floats [1/m]."""
+    steep, soft = WALL_PENALTY * (x**3 - held**3), np.minimum(x**2 / np.maximum(1 - x, 1e-9), 1e4)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = 1.0 / ((1.0 - free) / steep + free * extent / soft)
+    return WALL_PENALTY * held**3 + np.where(held < x, between, 0.0)
 
 
 def beyond(found: Clusters, pieces: tuple[Piece, ...], room: Array) -> tuple[Array, Array]:
     """How far clusters are out of reach, 0 to 1, by their middles; and what keeps charge off
     [1/m]."""
-    out, barrier = [], []
+    out, off_limits = [], []
     for points, owner in zip(found.points, found.owner, strict=True):
         off, edge = off_walls(points.mean(axis=0), room, pieces[owner].free)
         x, held = _smooth(off), _smooth(edge)
         arms = np.linalg.norm(points[:1] - points[1:3], axis=1) / 2
-        soft = min(x * x / max(1 - x, 1e-9), 1e4) / (math.sqrt(12) * arms.max())
         out.append(x)
-        barrier.append(WALL_PENALTY * held**3 + (soft if held < x else 0.0))
-    return np.array(out), np.array(barrier)
+        extent = math.sqrt(12) * arms.max()
+        off_limits.append(barrier(*np.array([x, held, pieces[owner].free, extent])))
+    return np.array(out), np.array(off_limits)
 
 
 def interaction(
     found: Clusters, pieces: tuple[Piece, ...], green: GreenFunction, room: Array
 ) -> Array:
     """Mean potentials of clusters on each other but for those of a body on itself [1/m]."""
-    out, barrier = beyond(found, pieces, room)
+    out, off_limits = beyond(found, pieces, room)
     psi = (1 - out)[:, None] * four_point_mean(found.points, green, "psi")
     image = found.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
     other = found.owner[:, None] != found.owner
@@ -140,7 +149,7 @@ def interaction(
         other, inverse_distances(found.points, found.points, found.softening_length), 0.0
     )
     images = inverse_distances(found.points, image, found.softening_length) + psi @ psi.T
-    return between - images + np.diag(barrier)
+    return between - images + np.diag(off_limits)
 
 
 def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
@@ -340,8 +349,8 @@ def reduced(
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
-LONG, WALL_FADE_LENGTH, BEHIND = (0.03, 0.06), 5e-3, 4e-3
-"""The first two in a domain of 0.5 m."""
+LONG, WALL_FADE_LENGTH, BEHIND, EXTENT = (0.03, 0.06), 5e-3, 4e-3, 0.5
+"""The first two in a domain of 0.5 m, whose shortest side is the last."""
 CLOSE, GROWTH, USUAL = (8e-3, 12e-3), 0.2, 0.015
 
 

@@ -18,8 +18,8 @@ WALL_EDGE = 0.01
 """Bodies are out of the room so far beyond its bounds, over the domain's shortest side. They fade
 out from the bounds on."""
 WALL_FADE_LENGTH = 0.08
-"""Conductors that are not at ground, whose potential the walls would else hold as they come in,
-fade out over this distance up to there, over that side; but not next to the design."""
+"""Floating conductors, whose potential the walls would else hold as they come in, fade out over
+this distance up to there, over that side; but not next to the design."""
 WALL_PENALTY = 1e5
 """Energy of charge that is out of reach [1/m]."""
 FADED = 1e4
@@ -44,8 +44,8 @@ class Space(NamedTuple):
     extent: float
     """Shortest side of the domain [m]."""
     inner: NDArray[Any]
-    """Corners of the box in which bodies are whole [m], of conductors that are not at ground the
-    second, shape (2, 2, 3)."""
+    """Corners of the box in which bodies are whole [m], of floating conductors the second, shape
+    (2, 2, 3)."""
     fade: NDArray[Any]
     """Over how much they fade out beyond each of its sides [m], shape (2, 2, 3)."""
     validity: float
@@ -98,10 +98,35 @@ def fading(room, box, extent):
 
 
 @kernel
+def looseness(elastance, space):
+    """How little a conductor is tied to ground, from 0 of one at ground to 1 of a floating one [-].
+
+    The walls take charge from it in proportion to the size of the domain: they hold the potential
+    of a conductor that is tied by much less, and hardly change that of one that is tied by more.
+
+    Args:
+        elastance: Of its tie to ground [1/m]; 4π eps0 = 1.
+        space: Surroundings of the design.
+    """
+    return 1.0 - 1.0 / (1.0 + elastance * space.extent)
+
+
+@kernel
+def wall(i, side, free, space):
+    """Where bodies begin to fade out at the lower or upper wall of axis ``i``, and how far on [m].
+
+    ``free`` is :func:`looseness` of conductors, else 0.
+    """
+    inner, fade = space.inner, space.fade
+    start = inner[0, side, i] + free * (inner[1, side, i] - inner[0, side, i])
+    return start, fade[0, side, i] + free * (fade[1, side, i] - fade[0, side, i])
+
+
+@kernel
 def off_walls(x, y, z, free, space):
     """How far a point is in what bodies fade out in, from 0 where they are whole to 1 [-].
 
-    ``free`` is 1 of conductors that are not at ground, else 0.
+    ``free`` is as of :func:`wall`.
 
     Returns:
         That; and the same at sides where all bodies fade out over one distance.
@@ -109,12 +134,12 @@ def off_walls(x, y, z, free, space):
     square = edge = 0.0
     for i in range(3):
         c = x if i == 0 else (y if i == 1 else z)
-        low = (space.inner[free, 0, i] - c) / space.fade[free, 0, i]
-        high = (c - space.inner[free, 1, i]) / space.fade[free, 1, i]
-        off = max(low, high, 0.0) ** 2
+        (low, before), (high, behind) = wall(i, 0, free, space), wall(i, 1, free, space)
+        off = max((low - c) / before, (c - high) / behind, 0.0) ** 2
         square += off
-        side = 0 if low > high else 1
-        edge += off if space.fade[free, side, i] == space.fade[0, side, i] else 0.0
+        side = 0 if c < low else 1
+        alike = free == 0.0 or space.fade[1, side, i] == space.fade[0, side, i]
+        edge += off if alike else 0.0
     return math.sqrt(square), math.sqrt(edge)
 
 
@@ -122,7 +147,7 @@ def off_walls(x, y, z, free, space):
 def out_of_reach(points, free, space, middle):
     """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face.
 
-    ``free`` is as of :func:`off_walls`; ``middle`` is workspace for a point, shape (3,).
+    ``free`` is as of :func:`wall`; ``middle`` is workspace for a point, shape (3,).
 
     Returns:
         By all; and by the face, and sides where all bodies fade out over one distance.
@@ -143,24 +168,35 @@ def out_of_reach(points, free, space, middle):
 
 
 @kernel
-def barrier(x, held, extent):
+def barrier(x, held, free, extent):
     """Energy that keeps charge off a leaf that is out of reach [1/m].
+
+    At walls that of floating conductors rises slowly, over their whole way, and that of others at
+    once; between them, as ``free`` says.
 
     Args:
         x, held: What :func:`out_of_reach` returns.
+        free: As of :func:`wall`.
         extent: Extent of the leaf [m].
     """
-    soft = min(x * x / max(1.0 - x, 1e-9), FADED) / extent if held < x else 0.0
-    return WALL_PENALTY * held**3 + soft
+    steep = WALL_PENALTY * (x**3 - held**3)
+    soft = min(x * x / max(1.0 - x, 1e-9), FADED) / extent
+    more = steep * soft / ((1.0 - free) * soft + free * steep) if held < x else 0.0
+    return WALL_PENALTY * held**3 + more
 
 
 @kernel
-def barrier_slope(x, held, extent):
+def barrier_slope(x, held, free, extent):
     """Derivative of :func:`barrier` by x, and by ``held`` where these are the same."""
-    if held < x:
-        y = 1.0 - x
-        return x * (2.0 - x) / (y * y * extent) if x * x < FADED * y else 0.0
-    return 3.0 * WALL_PENALTY * x * x
+    steep, slope = WALL_PENALTY * (x**3 - held**3), 3.0 * WALL_PENALTY * x * x
+    if held >= x:
+        return slope
+    y = max(1.0 - x, 1e-9)
+    faded = x * x >= FADED * y
+    soft = FADED / extent if faded else x * x / (y * extent)
+    rise = 0.0 if faded else x * (2.0 - x) / (y * y * extent)
+    sum_ = (1.0 - free) * soft + free * steep
+    return ((1.0 - free) * soft * soft * slope + free * steep * steep * rise) / (sum_ * sum_)
 
 
 @kernel

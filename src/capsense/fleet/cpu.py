@@ -170,7 +170,7 @@ def _seen(
     for c in range(count):
         conducts = records[c].inverse_susceptibility == 0.0
         tied = records[c].neutral != 0 or records[c].ground_elastance > 0.0
-        records[c].free = 1 if conducts and tied else 0
+        records[c].free = 1.0 if conducts and tied else 0.0
     tie_what_is_outside(records[:count], green.space)
     return count
 

@@ -120,7 +120,7 @@ class WarpActiveTree:
     mix: wp.array2d(dtype=wp.float32)  # the same in the functions solved for, see weigh, (n, v)
     weight: wp.array2d(dtype=wp.float32)
     barrier: wp.array2d(dtype=wp.float32)  # energy that keeps charge off [1/m], (l, v)
-    # of conductors not at ground, what is out of reach: capacitance, middle; then 1, (b, v)
+    # of conductors, what is out of reach: capacitance, middle; then their looseness, (b, v)
     outside: wp.array2d(dtype=five)
     walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
@@ -357,37 +357,39 @@ def lift_back(force: wp.vec3, p: wp.vec3, gap: float, green: Response):
 
 
 @wp.func
-def is_free(cut: WarpActiveTree, b: int, v: int):
-    """1 of a conductor that is not at ground, else 0."""
-    return wp.where(cut.outside[b, v][4] > 0.0, 1, 0)
+def wall(k: int, side: int, free: float, green: Response):
+    """Where bodies begin to fade out at lower or upper walls (k 0), or over what length (k 1)."""
+    return (1.0 - free) * green.walls[k, 0, side] + free * green.walls[k, 1, side]
 
 
 @wp.func
-def off_walls(c: wp.vec3, free: int, green: Response):
+def off_walls(c: wp.vec3, free: float, green: Response):
     """How far a point is in what bodies fade out in, along each axis: minus before lower walls."""
-    low = wp.cw_div(wp.max(green.walls[0, free, 0] - c, wp.vec3()), green.walls[1, free, 0])
-    high = wp.cw_div(wp.max(c - green.walls[0, free, 1], wp.vec3()), green.walls[1, free, 1])
+    low = wp.cw_div(wp.max(wall(0, 0, free, green) - c, wp.vec3()), wall(1, 0, free, green))
+    high = wp.cw_div(wp.max(c - wall(0, 1, free, green), wp.vec3()), wall(1, 1, free, green))
     return high - low
 
 
 @wp.func
-def at_edges(off: wp.vec3, free: int, green: Response):
+def at_edges(off: wp.vec3, free: float, green: Response):
     """What :func:`off_walls` returns at sides where all bodies fade out over one distance."""
     out = off
     for i in range(3):
         side = wp.where(off[i] < 0.0, 0, 1)
-        if green.walls[1, free, side][i] != green.walls[1, 0, side][i]:
+        if free > 0.0 and green.walls[1, 1, side][i] != green.walls[1, 0, side][i]:
             out[i] = 0.0
     return out
 
 
 @wp.func
-def barrier(x: float, held: float, extent: float):
+def barrier(x: float, held: float, free: float, extent: float):
     """Energy that keeps charge off a leaf that is out of reach, as ``face_kernels.barrier``."""
-    soft = float(0.0)
+    more = float(0.0)
     if held < x:
+        steep = _WALL_PENALTY * (x * x * x - held * held * held)
         soft = wp.min(x * x / wp.max(1.0 - x, 1.0e-9), _FADED) / extent
-    return _WALL_PENALTY * held * held * held + soft
+        more = steep * soft / ((1.0 - free) * soft + free * steep)
+    return _WALL_PENALTY * held * held * held + more
 
 
 @wp.kernel
@@ -417,8 +419,9 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
         points[q] = wp.transform_point(cut.pose[b, v], scale * shapes.points[k, q])
     cut.unlifted[i, v] = points
     c = 0.5 * (points[0] + points[3])
-    off = off_walls(c, is_free(cut, b, v), green)
-    edge = wp.length(at_edges(off, is_free(cut, b, v), green))
+    free = cut.outside[b, v][4]
+    off = off_walls(c, free, green)
+    edge = wp.length(at_edges(off, free, green))
     lifted = int(0)
     deep = float(0.0)
     if green.has_face != 0:
@@ -437,7 +440,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     cut.extent[i, v] = size
     cut.softening_length[i, v] = scale * shapes.softening_length[k]
     cut.outside_fraction[i, v] = smooth(wp.max(wp.length(off), deep))
-    cut.barrier[i, v] = barrier(cut.outside_fraction[i, v], smooth(wp.max(edge, deep)), size)
+    cut.barrier[i, v] = barrier(cut.outside_fraction[i, v], smooth(wp.max(edge, deep)), free, size)
     away = wp.length(off_box(0.5 * (points[0] + points[3]), green.box0, green.box1))
     cut.near[i, v] = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
 

@@ -137,18 +137,41 @@ def pack_gap(green: Green, gap: Gap, slots: int, device: Any) -> GapLaw:
     return out
 
 
+@wp.func
+def joint_tie(places: Places, b: int, e: int):
+    """Elastance to ground of the conductor of a body [1/m], less than 0 of a floating one.
+
+    Those out of sight count too.
+    """
+    grounded = int(0)
+    ground = float(0.0)
+    for c in range(places.group.shape[0]):
+        one = places.group[c] == places.group[b] and places.choice[e, c] >= 0
+        if one and places.neutral[e, c] == 0:
+            if places.ground_elastance[e, c][0] == 0.0:
+                grounded = 1
+            else:
+                ground += 1.0 / places.ground_elastance[e, c][0]
+    tie = wp.where(ground > 0.0, 1.0 / wp.max(ground, 1.0e-30), -1.0)
+    return wp.where(grounded == 1, 0.0, tie)
+
+
 @wp.kernel
 def find_outside(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
-    """How much of conductors not at ground is out of reach, as ``network_kernels``."""
+    """How loose conductors are, and how much of those not at ground is out of reach.
+
+    As ``network_kernels.tie_what_is_outside``.
+    """
     b, v = wp.tid()
     e = v // places.hidden.shape[0]
     out = five()
     cut.outside[b, v] = out
     u = places.choice[e, b]
-    loose = places.neutral[e, b] != 0 or places.ground_elastance[e, b][0] > 0.0
+    tie = joint_tie(places, b, e)
     conducts = places.inverse_susceptibility[e, b] == wp.vec2()
-    if u < 0 or places.hidden[v % places.hidden.shape[0], b] != 0 or not (loose and conducts):
+    if u < 0 or places.hidden[v % places.hidden.shape[0], b] != 0 or tie == 0.0 or not conducts:
         return
+    out[4] = wp.where(tie < 0.0, 1.0, 1.0 - 1.0 / (1.0 + tie * green.extent))
     first = shapes.first[u]
     scale = places.scale[e, b]
     outside = float(0.0)
@@ -157,7 +180,7 @@ def find_outside(shapes: Shapes, places: Places, green: Response, cut: WarpActiv
         part = shapes.children[first + k, 0]
         if part < 0 or part >= _COARSE - 1:  # else its parts stand for it
             at = wp.transform_point(cut.pose[b, v], scale * shapes.center[first + k])
-            share = shapes.charge[first + k] * smooth(wp.length(off_walls(at, 1, green)))
+            share = shapes.charge[first + k] * smooth(wp.length(off_walls(at, out[4], green)))
             outside += share
             middle += share * at
     if outside > 0.0:
@@ -166,7 +189,7 @@ def find_outside(shapes: Shapes, places: Places, green: Response, cut: WarpActiv
         out[0] = whole
         for i in range(3):
             out[1 + i] = middle[i]
-        cut.outside[b, v] = out
+    cut.outside[b, v] = out
 
 
 @wp.func
@@ -206,8 +229,6 @@ def connect(places: Places, cut: WarpActiveTree, terminals: int):
         neutral = places.neutral[e, b]
         if cut.node[o, v] >= 0:
             others = int(0)
-            grounded = int(0)
-            ground = float(0.0)
             for c in range(places.group.shape[0]):
                 if places.group[c] == places.group[b] and places.choice[e, c] >= 0:
                     if cut.node[c * cut.clusters, v] >= 0:
@@ -215,18 +236,11 @@ def connect(places: Places, cut: WarpActiveTree, terminals: int):
                         others = wp.where(c == b, others, 1)
                     if places.neutral[e, c] == 0:  # those out of sight count too
                         others = wp.where(c == b, others, 1)
-                        if places.ground_elastance[e, c][0] == 0.0:
-                            grounded = 1
-                        else:
-                            ground += 1.0 / places.ground_elastance[e, c][0]
             if others == 1:
-                neutral = wp.where(grounded == 0 and ground == 0.0, 1, 0)
-                tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
-            conducts = places.inverse_susceptibility[e, b] == wp.vec2()
-            if conducts and (neutral != 0 or tie[0] > 0.0):
-                found = cut.outside[b, v]
-                found[4] = 1.0
-                cut.outside[b, v] = found
+                joint = joint_tie(places, b, e)
+                neutral = wp.where(joint < 0.0, 1, 0)
+                tie = wp.vec2(wp.max(joint, 0.0), 0.0)
+            if cut.outside[b, v][4] > 0.0:
                 outside = outside_capacitance(places, cut, places.group[b], v)
                 if outside * _FLOATING_PENALTY > 1.0 and (neutral != 0 or tie[0] * outside > 1.0):
                     neutral = int(0)

@@ -18,12 +18,12 @@ from capsense.fleet.warp_cut import (
     at_edges,
     four,
     idle,
-    is_free,
     lift_back,
     off_box,
     off_walls,
     row,
     smooth,
+    wall,
 )
 from capsense.solver.interaction.pair_kernels import WIDE_CLUSTER
 from capsense.solver.tree.mean_kernels import FAR
@@ -56,7 +56,7 @@ class Leaf:
     softening_length: wp.float32
     outside_fraction: wp.float32
     barrier: wp.float32
-    free: wp.int32
+    free: wp.float32
     near: wp.float32
 
 
@@ -79,7 +79,7 @@ def leaf_of(cut: WarpActiveTree, i: int, v: int):
     out.outside_fraction = cut.outside_fraction[i, v]
     out.near = cut.near[i, v]
     out.barrier = cut.barrier[i, v]
-    out.free = is_free(cut, body_of(cut, i), v)
+    out.free = cut.outside[body_of(cut, i), v][4]
     return out
 
 
@@ -335,7 +335,7 @@ def wall_slope(green: Response, leaf: Leaf, origin: wp.vec3):
     if way < 1.0 and leaf.outside_fraction < 1.0:
         for i in range(3):
             side = wp.where(off[i] < 0.0, 0, 1)
-            slope[i] = 6.0 * (1.0 - way) * off[i] / green.walls[1, leaf.free, side][i]
+            slope[i] = 6.0 * (1.0 - way) * off[i] / wall(1, side, leaf.free, green)[i]
     return wp.spatial_vector(slope, wp.cross(c - origin, slope))
 
 
@@ -345,9 +345,16 @@ def barrier_slope(green: Response, leaf: Leaf):
     x = leaf.outside_fraction
     y = wp.max(1.0 - x, 1.0e-6)
     off = off_walls(0.5 * (leaf.points[0] + leaf.points[3]), leaf.free, green)
-    if wp.length(at_edges(off, leaf.free, green)) >= wp.length(off):
-        return 3.0 * _WALL_PENALTY * x * x
-    return wp.where(x * x < _FADED * y, x * (2.0 - x) / (y * y * leaf.extent), 0.0)
+    held = smooth(wp.length(at_edges(off, leaf.free, green)))
+    slope = 3.0 * _WALL_PENALTY * x * x
+    if held >= x:
+        return slope
+    steep = _WALL_PENALTY * (x * x * x - held * held * held)
+    soft = wp.min(x * x / y, _FADED) / leaf.extent
+    rise = wp.where(x * x < _FADED * y, x * (2.0 - x) / (y * y * leaf.extent), 0.0)
+    tight = 1.0 - leaf.free
+    all_ = tight * soft + leaf.free * steep
+    return (tight * soft * soft * slope + leaf.free * steep * steep * rise) / (all_ * all_)
 
 
 @wp.func

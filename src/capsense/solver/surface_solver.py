@@ -398,7 +398,7 @@ class SurfaceSolver:
         matter = bodies.matter
         if matter.lossy:
             ties = matter.ties(sizes_of(bodies.records, bodies.shapes))
-            free = (bodies.records["free"] != 0) & (bodies.records["neutral"] == 0)
+            free = (bodies.records["free"] > 0.0) & (bodies.records["neutral"] == 0)
             ties = np.where(free, bodies.records["ground_elastance"], ties)
             out = solve_lossy(
                 bodies.records, ties, matter.inverse_susceptibility, self.green,

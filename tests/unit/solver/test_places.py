@@ -12,7 +12,14 @@ from plain_leaves import plain_leaves
 from surface_scenes import Placed, green_of, pack, shape_of
 
 import capsense as cs
-from capsense.field.face_kernels import barrier, barrier_slope, fading, lift, out_of_reach
+from capsense.field.face_kernels import (
+    barrier,
+    barrier_slope,
+    fading,
+    lift,
+    looseness,
+    out_of_reach,
+)
 from capsense.field.green import LEVELS
 from capsense.field.green_kernels import Green, distances, level_share, pack_green
 from capsense.solver.gap.body_gap_kernels import facing_of
@@ -146,7 +153,7 @@ def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) 
         green.active_bounds, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]]
     )
     assert green.space.has_face
-    x, held = out_of_reach(around(np.array(center)), 0, green.space, np.empty(3))
+    x, held = out_of_reach(around(np.array(center)), 0.0, green.space, np.empty(3))
     assert x == held == approx(expected, abs=1e-9)
 
 
@@ -159,7 +166,7 @@ def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) 
 def test_conductors_not_at_ground_fade_out_early(center: tuple, whole: float, held: float) -> None:
     """Analytic: over 40 mm up to 10 mm before walls, but not at the floor or behind the face."""
     green = with_validity(green_of())
-    found = out_of_reach(around(np.array(center)), 1, green.space, np.empty(3))
+    found = out_of_reach(around(np.array(center)), 1.0, green.space, np.empty(3))
     np.testing.assert_allclose(found, (whole, held), rtol=0, atol=1e-9)
 
 
@@ -174,24 +181,44 @@ def test_walls_next_to_a_design_fade_all_bodies_alike() -> None:
     np.testing.assert_allclose(inner[1], [[-0.02, -0.279, -0.01], [0.279, 0.3, 0.279]])
 
 
-@pytest.mark.parametrize("held", [None, 0.0])
-def test_barrier_rises_by_its_slope(held: float | None) -> None:
+@pytest.mark.parametrize("held", [None, 0.0, 0.01])
+@pytest.mark.parametrize("free", [0.0, 0.02, 0.5, 1.0])
+def test_barrier_rises_by_its_slope(held: float | None, free: float) -> None:
     """Differential: central differences; it is 0 within reach, and never falls."""
-    x = np.linspace(0.0, 0.99, 34)
-    values = np.array([barrier(v, v if held is None else held, 0.03) for v in x])
-    assert values[0] == 0.0
+    x = np.linspace(0.0 if held is None else held, 0.99, 34)
+    values = np.array([barrier(v, v if held is None else held, free, 0.03) for v in x])
+    assert values[0] == 1e5 * x[0] ** 3
     assert (np.diff(values) > 0.0).all()
     step = 1e-6
     for v in x[1:]:
-        low, high = (barrier(w, w if held is None else held, 0.03) for w in (v - step, v + step))
-        slope = barrier_slope(v, v if held is None else held, 0.03)
+        low, high = (
+            barrier(w, w if held is None else held, free, 0.03) for w in (v - step, v + step)
+        )
+        slope = barrier_slope(v, v if held is None else held, free, 0.03)
         np.testing.assert_allclose((high - low) / (2 * step), slope, rtol=1e-5)
-    assert barrier_slope(1.0, 0.0, 0.03) == 0.0
+    assert barrier_slope(1.0, 0.0, 1.0, 0.03) == 0.0
+
+
+@pytest.mark.parametrize("center", [(0.22, 0.1, 0.3), (0.0, -0.231, 0.1), (0.237, 0.2, 0.473)])
+def test_a_large_tie_is_ground_and_none_is_floating(center: tuple) -> None:
+    """Limit: what a wall does to a conductor goes over into what it does to one at ground."""
+    green = with_validity(green_of())
+
+    def found(free: float) -> Array:
+        out = out_of_reach(around(np.array(center)), free, green.space, np.empty(3))
+        return np.array([out[0], barrier(*out, free, 0.03)])
+
+    ties = [looseness(e, green.space) for e in (0.0, 1e-12, 0.1, 1.0, 10.0, 1e12)]
+    np.testing.assert_allclose(ties, [0, 0, 0.05 / 1.05, 0.5 / 1.5, 5 / 6, 1], rtol=0, atol=1e-9)
+    values = np.array([found(free) for free in ties])
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-6)
+    np.testing.assert_allclose(values[-1], found(1.0), rtol=1e-6)
+    assert (np.diff(values[:, 0]) > -1e-12).all()
 
 
 def outside(center: Array, green: Green) -> float:
     """The outside fraction of four points with a centre, of a body at ground."""
-    return out_of_reach(around(center), 0, green.space, np.empty(3))[0]
+    return out_of_reach(around(center), 0.0, green.space, np.empty(3))[0]
 
 
 def around(center: Array) -> Array:
@@ -283,7 +310,7 @@ def test_charge_out_of_reach_has_a_large_energy() -> None:
     """Analytic: 1e5 per metre times the third power of how far it is beyond."""
     points = np.random.default_rng(4).uniform(-0.01, 0.01, (3, 4, 3))
     none, owner, size = np.zeros(3), np.zeros(3, int), np.full(3, 4e-3)
-    energy = np.array([barrier(x, x, 4e-3) for x in (0.0, 0.5, 1.0)])
+    energy = np.array([barrier(x, x, 0.0, 4e-3) for x in (0.0, 0.5, 1.0)])
     np.testing.assert_allclose(energy, [0.0, 12500.0, 1e5])
     leaves = plain_leaves(points, points, size, size, none, owner, none)
     first, second = (leaf_pairs(leaves._replace(barrier=e), -1e5) for e in (none, energy))

@@ -21,7 +21,7 @@ import numpy as np
 
 from capsense._dense import multiply, multiply_simd
 from capsense._jit import compiled, kernel
-from capsense.field.face_kernels import barrier_slope, off_walls, smooth
+from capsense.field.face_kernels import barrier_slope, off_walls, smooth, wall
 from capsense.field.green_kernels import distances, level_share
 from capsense.solver.placement.placement_kernels import (
     leaf_rows,
@@ -58,7 +58,7 @@ def jacobian(solution, bodies, green):
     work = np.zeros((count, 6, phi_columns, phi_columns), np.float32)
     fade, held, slope = _faded(solution, bodies, green.space)
     right = _add_design(points, charge, fade, bounds, green, work)
-    _add_fading(solution, fade, held, slope, right, green, work)
+    _add_fading(solution, bodies, fade, held, slope, right, green, work)
     _add_pairs(solution, bounds, green.floor, work)
     out = np.empty((count, m, m, 6))
     for b in range(count):
@@ -87,19 +87,19 @@ def _faded(solution, bodies, space):
     for j in range(n):
         c = 0.5 * (points[j, 0] + points[j, 3])
         free = bodies[solution.owner[j]].free
-        inner, length = space.inner[free], space.fade[free]
         off, edge = off_walls(c[0], c[1], c[2], free, space)
         fade[j], held[j] = smooth(off), smooth(edge)
         if 0.0 < off < 1.0:
             for i in range(3):
-                low = max(inner[0, i] - c[i], 0.0) / length[0, i] ** 2
-                high = max(c[i] - inner[1, i], 0.0) / length[1, i] ** 2
-                slope[j, i] = 6.0 * (1.0 - off) * (high - low)
+                low, before = wall(i, 0, free, space)
+                high, behind = wall(i, 1, free, space)
+                way = max(c[i] - high, 0.0) / behind**2 - max(low - c[i], 0.0) / before**2
+                slope[j, i] = 6.0 * (1.0 - off) * way
     return fade, held, slope
 
 
 @compiled
-def _add_fading(solution, fade, held, slope, right, green, work):
+def _add_fading(solution, bodies, fade, held, slope, right, green, work):
     """Add forces and torques by what leaves fade out in."""
     n, phi_columns = fade.shape[0], right.shape[1]
     some = np.empty(n, np.int64)
@@ -119,7 +119,7 @@ def _add_fading(solution, fade, held, slope, right, green, work):
     for k in range(count):
         j = some[k]
         b, x, charge = solution.owner[j], fade[j], solution.charge[j]
-        energy = 0.5 * barrier_slope(x, held[j], solution.extent[j])
+        energy = 0.5 * barrier_slope(x, held[j], bodies[b].free, solution.extent[j])
         c = 0.5 * (points[k, 0] + points[k, 3])
         s = slope[j]
         six = (

@@ -113,7 +113,7 @@ def _fill_leaves(bodies, cut, green, leaves, room):
                 corners[q, i] = points[q, i]  # before it is lifted
         beyond, held = out_of_reach(points, body.free, space, middle)
         leaves.outside_fraction[j] = beyond
-        leaves.barrier[j] = barrier(beyond, held, extent)
+        leaves.barrier[j] = barrier(beyond, held, body.free, extent)
         if space.has_face:
             keep_off(points, space)
 

@@ -13,7 +13,7 @@ import numpy as np
 from capsense._dense import WIDTH, padded
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
-from capsense.field.face_kernels import off_walls, smooth
+from capsense.field.face_kernels import looseness, off_walls, smooth
 from capsense.solver.system.system_kernels import System
 from capsense.solver.tree.matter import FLOATING_PENALTY
 
@@ -67,7 +67,7 @@ def outside_capacitance(bodies, group, space):
     count, charge, energy = bodies.shape[0], 0.0, 0.0
     parts, known = np.empty((count, 4)), 0
     for b in range(count):
-        if bodies[b].group == group and bodies[b].free != 0:
+        if bodies[b].group == group and bodies[b].free > 0.0:
             part = parts[known]
             _outside(bodies[b], space, part)
             charge += part[0]
@@ -86,13 +86,16 @@ def outside_capacitance(bodies, group, space):
 @compiled
 def tie_what_is_outside(bodies, space):
     """Tie conductors that are not at ground by at least what their parts out of reach have in free
-    space, in place.
+    space, and find their looseness, in place.
 
     A trunk grounds an arm that floats with it by its own capacitance to everything around, whether
     the domain reaches as far or not.
     """
     for b in range(bodies.shape[0]):
-        if bodies[b].free == 0:
+        if bodies[b].free > 0.0 and bodies[b].neutral == 0:
+            bodies[b].free = looseness(bodies[b].ground_elastance, space)
+    for b in range(bodies.shape[0]):
+        if bodies[b].free == 0.0:
             continue
         group, first = bodies[b].group, True
         for c in range(b):

@@ -295,7 +295,7 @@ def _add_outside_slopes(
     for b in range(bodies.shape[0]):
         body = bodies[b]
         outside = 0.0
-        if body.free != 0:
+        if body.free > 0.0:
             outside = outside_capacitance(bodies, body.group, green.space)
         if outside == 0.0 or abs(body.ground_elastance * outside - 1.0) > 1e-9:
             continue  # it has another tie

@@ -72,7 +72,7 @@ BODY = np.dtype(
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("sunk", np.float64),  # how far below that it stands in a cover [m], once it is pressed out
         ("neutral", np.int64),  # whether it carries no net charge
-        ("free", np.int64),  # whether it is a conductor that is not at ground
+        ("free", np.float64),  # how little a conductor is tied to ground, see ``looseness``
         ("group", np.int64),  # bodies that touch are one conductor, named by its first body
         # energy of a group's net charge beyond that of its field [1/m]
         ("ground_elastance", np.float64),
