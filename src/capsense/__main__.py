@@ -88,7 +88,7 @@ def build_parser() -> argparse.ArgumentParser:
             aliases=ALIASES.get(command.name, []),
             help=command.help,
             description=description,
-            epilog=f"examples:\n{examples}\n\n{EXIT_CODES}",
+            epilog=f"examples:\n{examples}\n\nexit codes: see 'capsense --help'",
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )

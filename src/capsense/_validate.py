@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._file_kinds import other_kind
 from capsense.errors import CapSenseError
 
 MAX_LENGTH = 10.0
@@ -105,13 +106,19 @@ def read_toml(
         CapSenseError: An ``error`` that names the path, if it is missing, unreadable or not TOML.
     """
     try:
-        return tomllib.loads(read_file(path).decode())
+        data = tomllib.loads(read_file(path).decode())
     except FileNotFoundError:
         raise error(f"there is no {what} file {path}; check the path{hint}") from None
     except OSError as cause:
         raise error(f"{path} cannot be read: {cause.strerror}; give a .toml file") from None
     except (ValueError, RecursionError) as cause:
-        raise error(f"{path} is not valid TOML: {cause}; correct the line it names") from None
+        other = other_kind(path, what)
+        raise error(
+            other or f"{path} is not valid TOML: {cause}; correct the line it names"
+        ) from None
+    if other := other_kind(path, what, data):
+        raise error(f"{other}; give a {what} file")
+    return data
 
 
 def read_file(path: Path) -> bytes:
@@ -162,6 +169,13 @@ class Table:
         for key in self.data:
             if key not in valid:
                 raise self.error(f"unknown key {key!r}; {suggest(key, valid)}")
+
+    def needs(self, *keys: str) -> None:
+        """Name all of ``keys`` that are missing, if there are several; the reader of a single one
+        says what it takes."""
+        missing = [repr(key) for key in keys if key not in self.data]
+        if len(missing) > 1:
+            raise self.error(f"missing keys {', '.join(missing[:-1])} and {missing[-1]}; add them")
 
     def raw(self, key: str, expected: str) -> Any:
         """The value of a mandatory key."""

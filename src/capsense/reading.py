@@ -124,6 +124,12 @@ class Reading:
         return self.stats.solver_error
 
     @property
+    def in_contact(self) -> bool:
+        """Whether a body touches an electrode or lies inside one, so that the reading means
+        nothing; its estimated error is then as large as the largest capacitance."""
+        return bool(self.stats.solver_error >= np.abs(self.capacitance).max())
+
+    @property
     def held(self) -> Held | None:
         """What the chip's registers hold, ``counts.held()``, where a readout is configured."""
         return None if self.counts is None else self.counts.held()

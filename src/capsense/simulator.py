@@ -47,7 +47,7 @@ _DOUBTFUL, _SEEN = 0.1, 1e-4
 """Estimated errors are warned of above this part of a change, and of the largest capacitance."""
 
 
-ONCE = "Further warnings are suppressed; reading.stats.solver_error has the estimate"
+ONCE = "Further warnings are suppressed; every reading has its own estimate, solver_error"
 
 
 class Doubt(NamedTuple):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from capsense.cli import (
@@ -164,13 +166,14 @@ def export(args: argparse.Namespace) -> int:
         type=Path,
     ),
     arg("--electrode NAME", "with --plot: the electrode; default the first"),
+    arg("--sensor NAME", "which sensor of a recorded skin"),
 )
 def readout(args: argparse.Namespace) -> int:
     """Turn the capacitances of a recording into what a chip reports: one channel after another,
     late, noisy, quantised, within its range.
 
-    A recording is the output folder of capsense run, or readings.npz or readings.csv in it.
-    Beside it, or in the folder given with -o, is written
+    A recording is the output folder of capsense run, readings.npz or readings.csv in it, or an
+    .mcap file of capsense record. Beside it, or in the folder given with -o, is written
       counts_CHIP.csv   one row per conversion: time stamp, channel, code, capacitance, flags
 
     Between samples of the recording capacitances are interpolated linearly.
@@ -178,6 +181,7 @@ def readout(args: argparse.Namespace) -> int:
     examples:
       capsense readout --list                               the chips, with sources of their figures
       capsense readout out/ --chip fdc1004
+      capsense readout hand.mcap --chip fdc1004
       capsense readout out/ --chip fdc1004 --rate 400 --seed 3 -o counts/
       capsense readout out/ --config my_chip.toml           options from a file
       capsense readout out/ --chip all --plot chips.png     all chips side by side, no tables
@@ -187,10 +191,9 @@ def readout(args: argparse.Namespace) -> int:
         print(_chips(args.chip))
         return OK
     _check_options(args)
-    from capsense.readout.recording import load_recording
     from capsense.recording.tables import write_counts
 
-    recording = load_recording(args.recording)
+    recording = _recorded(args.recording, args.sensor)
     readouts = _build(args, recording)
     if args.plot is not None:
         from capsense.plotting.designs import plot_chips
@@ -208,10 +211,30 @@ def readout(args: argparse.Namespace) -> int:
     return OK
 
 
+def _recorded(path: Path, sensor: str | None) -> CapacitanceRecord:
+    """The capacitances in the folder or tables of a run, or in an MCAP file."""
+    from capsense.readout.recording import load_recording
+
+    if path.suffix.lower() != ".mcap":
+        return load_recording(path)
+    from capsense.recording.export import export
+    from capsense.recording.reader import open_recording
+
+    recording = open_recording(path, sensor)
+    if not recording.complete:
+        say(f"warning: {path} was not closed; what was written until then is read")
+    with TemporaryDirectory() as folder:
+        arrays = Path(folder) / "readings.npz"
+        export(recording, arrays)
+        return replace(load_recording(arrays), path=path)
+
+
 def _check_options(args: argparse.Namespace) -> None:
     """Refuse what does not go together before anything is computed."""
     if args.recording is None:
         raise ReadoutError("no recording given; name the output folder of capsense run, or --list")
+    if args.sensor is not None and args.recording.suffix.lower() != ".mcap":
+        raise ReadoutError("--sensor goes with an .mcap file; a run is of one sensor")
     if bool(args.chip) == (args.config is not None):
         raise ReadoutError("give --chip NAME or --config FILE.toml, one of them")
     files = args.config is not None or any(name.endswith(".toml") for name in args.chip)

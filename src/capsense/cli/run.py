@@ -35,6 +35,10 @@ if TYPE_CHECKING:
     from capsense.simulator import Simulator
 
 
+PRESET = arg(
+    "--preset", "how finely surfaces are resolved; default standard",
+    choices=("fast", "standard", "fine"),
+)  # fmt: skip
 SCENARIO = (arg("scenario SCENARIO.toml", "the scenario file", type=Path), RATE, QUIET)
 
 
@@ -49,8 +53,8 @@ def chosen_scenario(args: argparse.Namespace) -> Scenario:
 def _load(args: argparse.Namespace) -> Scenario:
     """The scenario; warns of bodies that it does without."""
     scenario = chosen_scenario(args)
-    for name in absent_bodies(scenario):
-        say(f'warning: body "{name}" never enters the domain; it has no effect')
+    for warning in absent_bodies(scenario):
+        say(f"warning: {warning}")
     return scenario
 
 
@@ -58,6 +62,7 @@ def _load(args: argparse.Namespace) -> Scenario:
     "run",
     "simulate a scenario file and write its readings",
     *SCENARIO,
+    PRESET,
     arg("-o --output DIR", "folder for the results", type=Path, required=True),
     arg("--force", "replace the results in a folder that is not empty"),
 )
@@ -86,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     prepare_folder(args.output, force=args.force)
     with Interrupt() as interrupt:
         try:
-            simulator = build_simulator(scenario, quiet=args.quiet)
+            simulator = build_simulator(scenario, quiet=args.quiet, preset=args.preset)
             recorder = RunWriter(args.output, scenario, simulator.step(Scene()))
         except BaseException:
             if made:
@@ -132,27 +137,49 @@ def _ending(interrupt: Interrupt, count: int, planned: int) -> int:
 
 
 def absent_bodies(scenario: Scenario) -> list[str]:
-    """Names of the bodies that never enter the domain, looked for at up to 500 samples."""
+    """What to say of bodies that never enter the domain, looked for at up to 500 samples."""
     import numpy as np
 
     lower, upper = scenario.design.domain.sight
-    seen = np.zeros(len(scenario.bodies), dtype=bool)
+    count = len(scenario.bodies)
+    seen, least, nearest = (
+        np.zeros(count, dtype=bool),
+        np.full(count, np.inf),
+        np.zeros((count, 2, 3)),
+    )
     stride = max(1, scenario.count // 500)
     for time in scenario.times[::stride]:
         bounds = scenario.scene_at(float(time)).pack().bounds
-        inside = (bounds[:, 0] < upper) & (bounds[:, 1] > lower)
-        seen |= inside.all(axis=1)
+        apart = np.maximum(bounds[:, 0] - upper, lower - bounds[:, 1])
+        seen |= (apart < 0.0).all(axis=1)
         if seen.all():
             break
-    return [str(b.body.name) for b, ever in zip(scenario.bodies, seen, strict=True) if not ever]
+        way = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+        nearer = way < least
+        least[nearer], nearest[nearer] = way[nearer], bounds[nearer]
+    return [
+        f'body "{b.body.name}" never enters the domain and has no effect: at its nearest it spans '
+        f"{_span(nearest[k])} m, and the domain {_span((lower, upper))} m"
+        for k, b in enumerate(scenario.bodies)
+        if not seen[k]
+    ]
 
 
-def build_simulator(scenario: Scenario, *, quiet: bool) -> Simulator:
+def _span(corners: Any) -> str:
+    """A box, such as ``x -0.1 to 0.1, y …``."""
+    ends = zip("xyz", *corners, strict=True)
+    return ", ".join(f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in ends)
+
+
+def build_simulator(scenario: Scenario, *, quiet: bool, preset: str | None = None) -> Simulator:
     """The simulator that a scenario asks for, with a bar while its field is built."""
     import capsense
 
+    chosen: dict[str, Any] = {} if preset is None else {"preset": preset}
     with BuildProgress(quiet=quiet) as progress:
-        return capsense.Simulator(scenario.design, method=scenario.method, progress=progress)
+        return capsense.Simulator(
+            scenario.design, method=scenario.method, progress=progress, **chosen
+        )
 
 
 def play_samples(
@@ -209,8 +236,14 @@ def _run_report(summary: dict[str, Any], folder: Path) -> str:
         lines.append(("step time", ", ".join(times)))
         error = summary["largest_error_estimate_F"]
         lines.append(("error", f"{error:.2g} F, the largest of the estimates"))
+    contact, channels = summary["samples_in_contact"], summary["channels"]
+    if contact:
+        meant = "are left out below" if contact < summary["samples"] else "are all there is"
+        lines.append(
+            ("contact", f"{contact} samples mean nothing, since a body touches an electrode; they "
+             f"{meant}, and have 1 in the column contact of readings.csv")
+        )  # fmt: skip
     blocks = [facts(lines)]
-    channels = summary["channels"]
     if step is not None:
         if summary["excitation"] == "matrix":
             blocks.append("Maxwell matrix; the mutual capacitance of a pair is minus its entry")
@@ -247,6 +280,7 @@ def _channel_row(channel: dict[str, Any]) -> list[str]:
     "record",
     "simulate a scenario file and record every step as MCAP, for ROS 2 and Foxglove",
     *SCENARIO,
+    PRESET,
     arg("-o --output FILE.mcap", "the recording", type=Path, required=True),
     arg("--force", "replace a file that is there"),
     arg("--readout CHIP|FILE.toml", "record what a chip reports, too: its name, or a readout file"),
@@ -282,7 +316,7 @@ def record(args: argparse.Namespace) -> int:
     check_name(args.name)
     make_readout(args.readout, scenario.design.electrode_names)
     with Interrupt() as interrupt:
-        simulator = build_simulator(scenario, quiet=args.quiet)
+        simulator = build_simulator(scenario, quiet=args.quiet, preset=args.preset)
         recorder = Recorder(
             args.output, simulator, name=args.name, readout=args.readout, scenario=scenario,
             overwrite=args.force,

@@ -149,6 +149,7 @@ def parse_design(
     """
     top = DesignTable(data, source, "design")
     top.only(TOP_KEYS)
+    top.needs("name", "domain")
     name = top.string("name")
     description = top.text("description")
     domain = _read_domain(DesignTable(top.raw("domain", "a [domain] table"), source, "domain"))
@@ -163,9 +164,7 @@ def parse_design(
             out.append(DesignTable(raw, source, tag, limit))
         return out
 
-    electrodes = [
-        Electrode(t.string("name"), _read_surface(t, where, domain, ())) for t in items("electrode")
-    ]
+    electrodes = [_read_electrode(t, where, domain) for t in items("electrode")]
     for table in items("electrodes_from_stl"):
         from capsense.design.stl_shape import read_imprint_group
 
@@ -224,6 +223,7 @@ def parse_design(
 
 def _read_domain(table: DesignTable) -> Domain:
     table.only(("size", "backplane", "open"))
+    table.needs("size", "backplane")
     sx, sy, sz = table.sizes("size", 3, "[x, y, z] in metres")
     backplane = table.length("backplane")
     if backplane >= sz:
@@ -232,6 +232,11 @@ def _read_domain(table: DesignTable) -> Domain:
             "distance from the electrode plane z = 0 down to the box's floor"
         )
     return Domain((sx, sy, sz), backplane, table.boolean("open", False))
+
+
+def _read_electrode(table: DesignTable, folder: Path, domain: Domain) -> Electrode:
+    table.needs("name", "shape")
+    return Electrode(table.string("name"), _read_surface(table, folder, domain, ()))
 
 
 def _read_build(table: DesignTable) -> dict[str, float]:
@@ -276,6 +281,7 @@ def _bent(sheet: Electrode | Conductor, radius: float, source: str) -> Surface:
 def _read_conductor(
     table: DesignTable, folder: Path, domain: Domain, electrodes: list[Electrode]
 ) -> Conductor:
+    table.needs("name", "shape", "role")
     name = table.string("name")
     surface = _read_surface(table, folder, domain, ("role", "clearance"))
     role = Role(table.choice("role", [r.value for r in Role]))
@@ -292,6 +298,7 @@ def _read_layer(table: DesignTable, folder: Path) -> Layer:
         lower, upper = Surface(facets, np.empty((0, 2, 3))).bounds
         return Layer(name, material, eps_r, lower, upper, facets)
     table.only((*LAYER_KEYS, "size", "center", "z"))
+    table.needs("size", "z")
     sx, sy = table.sizes("size", 2, "[x, y] in metres")
     cx, cy = table.coordinates("center", (2,), (0.0, 0.0))
     z0, z1 = table.interval("z")

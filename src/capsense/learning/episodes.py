@@ -288,6 +288,7 @@ def load_episodes(path: str | Path) -> Episodes:
     file = Path(path)
     top = ScenarioTable(read_toml(file, "data set", ScenarioError), file.name, "data set")
     top.only(TOP_KEYS)
+    top.needs("name", "environment", "episodes")
     options = ScenarioTable(top.data.get("options", {}), file.name, "options")
     environment = top.string("environment")
     spec = Episodes(

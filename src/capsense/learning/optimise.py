@@ -270,6 +270,7 @@ def load_task(path: str | Path) -> DesignTask:
     file = Path(path)
     top = Table(read_toml(file, "task", ScenarioError), file.name, "task")
     top.only(TOP_KEYS)
+    top.needs("name", "parameters", "design")
 
     def part(key: str, keys: tuple[str, ...] | None = None) -> Table:
         table = Table(top.data.get(key, {}), file.name, key)

@@ -286,6 +286,7 @@ def load_spec(path: str | Path) -> Spec:
     file = Path(path)
     top = ScenarioTable(read_toml(file, "data set", ScenarioError), file.name, "data set")
     top.only(TOP_KEYS)
+    top.needs("name", "design", "scenes")
     folder = file.resolve().parent
     bodies = tuple(top.tables("body"))
     if not bodies:

@@ -249,6 +249,7 @@ _OF_PAIRS = {
 
 def _pattern(table: ReadoutTable, electrodes: Sequence[str]) -> Pattern:
     table.only(("name", "sense", "drive", "floating", "rest", "shield", "low", "minus"))
+    table.needs("name", "sense")
     sense: Any = table.raw("sense", 'an electrode, "E1", several, ["E1", "E2"], or their weights')
     if isinstance(sense, dict):
         sense = _weights(table, "sense", electrodes)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from capsense._file_kinds import other_kind
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern
 from capsense.readout.checks import Array
@@ -119,13 +120,9 @@ def load_recording(path: str | Path) -> CapacitanceRecord:
         given = present[0]
     if not given.is_file():
         raise ReadoutError(f"there is no recording {given}; check the path")
-    if given.suffix == ".mcap":
-        raise ReadoutError(
-            f"{given} is to be exported first: capsense export {given} -o "
-            f"{given.with_suffix('.npz').name}"
-        )
     if given.suffix not in (".npz", ".csv"):
-        raise ReadoutError(f"{given} is no recording; give a .npz, a .csv, or their folder")
+        other = other_kind(given, "readings") or f"{given} is no recording"
+        raise ReadoutError(f"{other}; give a .npz, a .csv, or their folder")
     recording = _load_arrays(given) if given.suffix == ".npz" else _load_table(given)
     _check(recording)
     return recording

@@ -100,8 +100,8 @@ def _csv(recording: Recording, path: Path) -> int:
         meanings = column_meanings(session.channels, session.design)
         rows.writerow([*(name for name, _ in meanings), "episode"])
         for step, values in _values(recording):
-            touch = touch_values(step.reading, session.design)
-            rows.writerow([*csv_row(step.clock, values, levels, touch), step.episode])
+            row = csv_row(step.clock, values, levels, step.reading, session.design)
+            rows.writerow([*row, step.episode])
             n += 1
     return n
 
@@ -120,7 +120,8 @@ def _parquet(recording: Recording, path: Path) -> int:
             values = np.array([v for _, v in batch])
             touch = np.array([touch_values(s.reading, session.design) for s, _ in batch])
             columns = [[s.clock for s, _ in batch], *values.T, *(values - levels).T, *touch.T]
-            columns.append([s.episode for s, _ in batch])
+            columns += [[float(s.reading.in_contact) for s, _ in batch]]
+            columns += [[s.episode for s, _ in batch]]
             arrays = [pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
             n += len(batch)

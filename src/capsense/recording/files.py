@@ -12,6 +12,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from capsense._file_kinds import other_kind
 from capsense.errors import RecordingError, require_package
 from capsense.recording import ros
 
@@ -146,7 +147,10 @@ def ends_well(path: Path) -> bool:
                 return file.tell() > 0 and file.read() == MAGIC
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-    raise RecordingError(f"{path} is no MCAP file; give one that capsense record wrote")
+    other = other_kind(path, "recording")
+    raise RecordingError(
+        f"{other or f'{path} is no MCAP file'}; give a recording, which capsense record writes"
+    )
 
 
 def read_records(path: Path) -> Iterator[Record]:

@@ -39,6 +39,7 @@ def column_meanings(channels: Sequence[Channel], design: Design) -> list[tuple[s
         *((f"{c.column_name}_F", f"{c.meaning}, F") for c in channels),
         *((f"d{c.column_name}_F", f"{c.meaning}, {change}, F") for c in channels),
         *touch_meanings(design),
+        ("contact", "1 where a body touches an electrode and the sample means nothing, else 0"),
     ]
 
 
@@ -64,16 +65,20 @@ def touch_values(reading: Reading, design: Design) -> list[float]:
     return [*touch.force.tolist(), *touch.compression.tolist(), touch.total]
 
 
-def csv_row(time: float, values: Array, levels: Array, touch: Sequence[float] = ()) -> list[str]:
+def csv_row(
+    time: float, values: Array, levels: Array, reading: Reading, design: Design
+) -> list[str]:
     """A row of ``readings.csv``.
 
     Args:
         time: [s].
         values: Capacitance of each channel [F], shape (K,).
         levels: The same with an empty scene [F], shape (K,).
-        touch: What :func:`touch_values` gives.
+        reading: What they are of.
+        design: Of the sensor.
     """
-    return [f"{time:.12g}", *(f"{v:.10g}" for v in (*values, *(values - levels), *touch))]
+    numbers = (*values, *(values - levels), *touch_values(reading, design))
+    return [f"{time:.12g}", *(f"{v:.10g}" for v in numbers), str(int(reading.in_contact))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +108,11 @@ class Run:
         """Capacitance of each channel [F], shape (n, K)."""
         shape = len(self.times), len(self.channels)
         return np.reshape([read_channels(self.channels, r) for r in self.readings], shape)
+
+    @property
+    def contact(self) -> NDArray[np.bool_]:
+        """Which samples mean nothing since a body touches an electrode, shape (n,)."""
+        return np.array([r.in_contact for r in self.readings], dtype=bool)
 
     def poses(self) -> tuple[tuple[str, ...], Array, Array]:
         """Names of the B bodies, and their places in the sensor frame.
@@ -142,6 +152,7 @@ class Run:
             "iterations": np.array([s.iterations for s in stats], dtype=np.int64),
             "error_estimate": np.array([s.solver_error for s in stats]),
             "step_time": np.array([s.wall_time for s in stats]),
+            "contact": self.contact,
         }
         if self.design.cover is not None:
             rows = np.reshape([touch_values(r, self.design) for r in self.readings], (n, 2 * m + 1))
@@ -268,8 +279,8 @@ class RunWriter:
             OSError: The row could not be written; neither it nor the sample is there then.
         """
         run = self.run
-        touch = touch_values(sample.reading, run.design)
-        self._write_row(csv_row(sample.time, np.array(sample.values), run.levels, touch))
+        values = np.array(sample.values)
+        self._write_row(csv_row(sample.time, values, run.levels, sample.reading, run.design))
         run.times.append(sample.time)
         run.readings.append(sample.reading)
         run.scenes.append(sample.scene)
@@ -295,7 +306,8 @@ class RunWriter:
         scenario, n = self.scenario, self.count
         stats = [r.stats for r in self.run.readings]
         touches = [r.touch for r in self.run.readings if r.touch is not None]
-        design, columns = scenario.design, self.run.values.T
+        design, contact = scenario.design, self.run.contact
+        columns = self.run.values[~contact if not contact.all() else contact].T
         return {
             "scenario": scenario.name, "design": design.name,
             "design_hash": design.content_hash(), "electrodes": design.electrode_names,
@@ -308,6 +320,7 @@ class RunWriter:
             "unknowns": _quantiles([s.unknowns for s in stats]),
             "iterations": _quantiles([s.iterations for s in stats]),
             "largest_error_estimate_F": max((s.solver_error for s in stats), default=None),
+            "samples_in_contact": int(contact.sum()),
             "channels": [
                 {"name": channel.column_name, "meaning": channel.meaning,
                  "baseline_F": float(level), "min_F": float(values.min()) if n else None,

@@ -54,6 +54,7 @@ def read_body(table: ScenarioTable, name: str, folder: Path) -> MovingBody:
     shape_name = table.choice("shape", [*SHAPES, "mesh"])
     lengths = MESH_KEYS if shape_name == "mesh" else tuple(lengths_of(shape_name))
     table.only((*BODY_KEYS, *lengths))
+    table.needs("material", *lengths)
     shape = _read_shape(table, shape_name, folder)
     material = read_material(table)
     grounding = read_grounding(table)
@@ -178,6 +179,7 @@ def read_pose(table: ScenarioTable) -> Pose:
 
 def _read_trajectory(table: ScenarioTable) -> Trajectory:
     table.only(TRAJECTORY_KEYS)
+    table.needs("waypoints", "speed")
     points = table.vectors("waypoints", 3, "[x, y, z] in metres")
     for number, point in enumerate(points):
         for value in point:
@@ -228,6 +230,7 @@ def read_bodies(top: ScenarioTable, folder: Path) -> tuple[MovingBody, ...]:
         label = raw.get("name") if isinstance(raw, Mapping) else None
         tag = f'body "{label}"' if isinstance(label, str) and label else f"body {number}"
         table = ScenarioTable(raw, top.source, tag)
+        table.needs("name", "shape", "material")
         name = table.string("name")
         if name in names:
             raise table.error(f"two bodies are named {name!r}; names must differ")

@@ -61,6 +61,7 @@ def parse_scenario(
     top = ScenarioTable(data, source, "scenario")
     _refuse_former(top)
     top.only(TOP_KEYS)
+    top.needs("name", "design", "sample_rate")
     name = top.string("name")
     design = read_design(top, where)
     sample_rate = top.number("sample_rate", 1e-3, 1e6, unit="Hz")

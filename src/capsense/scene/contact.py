@@ -181,8 +181,7 @@ def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array], touch: float)
         warnings.warn(
             f"{found.electrodes} {how} {listed(found.bodies, 4)}{deep} and readings mean nothing "
             f"until this ends; keep bodies at least {1e3 * touch:.2g} mm in front of the "
-            "electrodes. Further warnings are suppressed; reading.stats.solver_error then is as "
-            "large as the largest capacitance",
+            "electrodes. Such readings are marked as in contact; further warnings are suppressed",
             stacklevel=4,
         )
 

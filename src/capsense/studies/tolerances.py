@@ -248,6 +248,7 @@ def load_study(path: str | Path) -> tuple[ToleranceStudy, Capacitances]:
     file = Path(path)
     top = Table(read_toml(file, "study", ScenarioError), file.name, "study")
     top.only(TOP_KEYS)
+    top.needs("name", "parameters")
     top.string("name")
     table = Table(top.raw("parameters", "[parameters], what scatters"), file.name, "parameters")
     if not table.data:

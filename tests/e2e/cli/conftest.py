@@ -30,6 +30,7 @@ class FakeReading:
     delta: Array
     stats: FakeStats
     touch: None = None
+    in_contact: bool = False
 
     @property
     def self_capacitance(self) -> Array:

@@ -126,13 +126,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_help_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    """Each help page has examples, which parse, and the exit codes."""
+    """Each help page has examples, which parse, and says where exit codes are explained."""
     for command in COMMANDS:
         with pytest.raises(SystemExit) as stopped:
             main([command.name, "--help"])
         assert stopped.value.code == 0
         text = capsys.readouterr().out
-        assert "exit codes:" in text
+        assert text.count("exit codes:") == 1
+        assert text.endswith("exit codes: see 'capsense --help'\n")
         _, _, lines = cleandoc(command.execute.__doc__ or "").partition("examples:\n")
         examples = [line.strip().split("   ")[0].split() for line in lines.splitlines()]
         assert len(examples) >= 2

@@ -49,6 +49,24 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def test_recordings_read_out_as_runs(tmp_path: Path, capsys) -> None:
+    """Differential: the counts of an .mcap file are those of the same run, to the last digit."""
+    scenario, recording = tmp_path / "ball.toml", tmp_path / "ball.mcap"
+    scenario.write_text(ball_scenario(), encoding="utf-8")
+    options = ["--chip", "fdc1004", "--seed", "3"]
+    assert main(["run", str(scenario), "-o", str(tmp_path / "run"), "-q"]) == OK
+    assert main(["readout", str(tmp_path / "run"), *options]) == OK
+    assert main(["record", str(scenario), "-o", str(recording), "-q"]) == OK
+    assert main(["readout", str(recording), *options]) == OK
+    name = "counts_fdc1004.csv"
+    assert (tmp_path / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    capsys.readouterr()
+    assert main(["readout", str(recording), *options, "--sensor", "other"]) == BAD_INPUT
+    assert "has no sensor 'other'" in capsys.readouterr().err
+    assert main(["readout", str(tmp_path / "run"), *options, "--sensor", "a"]) == BAD_INPUT
+    assert "--sensor goes with an .mcap file" in capsys.readouterr().err
+
+
 def test_tables_hold_what_python_gives(run, capsys):
     """Differential: the command's table against the readout called directly."""
     folder = run()
@@ -250,7 +268,7 @@ def test_bad_recordings_are_refused(run, tmp_path):
         load_recording(names)
     whole = tmp_path / "whole.mcap"
     whole.write_bytes(b"")
-    with pytest.raises(ReadoutError, match=r"capsense export .*whole.mcap -o whole.npz"):
+    with pytest.raises(ReadoutError, match=r"whole\.mcap is a recording; capsense replay or"):
         load_recording(whole)
     odd = tmp_path / "odd.csv"
     odd.write_bytes(b"time_s,C_a_F,C_b_F,C_a_b_F\n0,1,1,1\n")

@@ -122,7 +122,7 @@ def test_excitations(scenario: Path, tmp_path: Path, excitation: str, columns: l
     rows = rows_of(tmp_path / "out")
     assert set(columns) <= set(rows[0])
     assert all(v > 0 for row in rows for k, v in row.items() if k.startswith("C"))
-    assert len(rows[0]) == 1 + 2 * len(summary_of(tmp_path / "out")["channels"])
+    assert len(rows[0]) == 2 + 2 * len(summary_of(tmp_path / "out")["channels"])
 
 
 @pytest.mark.usefixtures("fake")
@@ -167,7 +167,36 @@ def test_body_outside_is_told(
     """A body that never comes into the domain is likely a mistake: a warning, no refusal."""
     scenario.write_text(scenario.read_text().replace("0.04]", "0.9]"), encoding="utf-8")
     assert main(["run", str(scenario), "-o", str(tmp_path / "out")]) == 0
-    assert 'warning: body "ball" never enters the domain' in capsys.readouterr().err
+    told = " ".join(capsys.readouterr().err.split())
+    assert 'warning: body "ball" never enters the domain and has no effect' in told
+    assert "at its nearest it spans x -0.08 to -0.04, y -0.02 to 0.02, z 0.88 to 0.92 m" in told
+    assert "and the domain x -0.25 to 0.25, y -0.25 to 0.25, z " in told
+
+
+def test_samples_in_contact_are_marked(
+    scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Differential: against signed distances; extremes leave such samples out."""
+    text = scenario.read_text().replace("0.04]", "0.015]").replace("0.06", "0.2")
+    scenario.write_text(text.replace("speed = 0.1", "speed = 0.35"), encoding="utf-8")
+    out = tmp_path / "out"
+    assert main(["run", str(scenario), "-o", str(out), "--preset", "fast"]) == 0
+    text, errors = capsys.readouterr()
+    assert errors.count("readings mean nothing until this ends") == 1
+    rows, summary = rows_of(out), summary_of(out)
+    arrays = np.load(out / "readings.npz")
+    marked = np.array([row["contact"] == 1.0 for row in rows])
+    np.testing.assert_array_equal(marked, arrays["contact"])
+    largest = np.abs(arrays["capacitance"]).max(axis=(1, 2))
+    np.testing.assert_array_equal(marked, arrays["error_estimate"] >= largest)
+    sensor = cs.load_design("six_patch")
+    corners = np.concatenate([e.surface.triangles.reshape(-1, 3) for e in sensor.electrodes])
+    apart = [np.linalg.norm(corners - p, axis=1).min() for p in arrays["body_positions"][:, 0]]
+    assert marked[np.array(apart) < 0.02].all()
+    assert 0 < summary["samples_in_contact"] == marked.sum() < len(rows)
+    for channel, column in zip(summary["channels"], arrays["channels"][~marked].T, strict=True):
+        assert (channel["min_F"], channel["max_F"]) == (column.min(), column.max())
+    assert f"contact    {int(marked.sum())} samples mean nothing" in text
 
 
 # ---- what is refused, before anything is computed ----
