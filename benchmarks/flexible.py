@@ -1,0 +1,310 @@
+"""Cloth, cables and soft bodies that are bent, folded and pressed, against boundary elements.
+
+    python benchmarks/flexible.py                 # errors of the scenes, and times of steps
+    python benchmarks/flexible.py --only cloth
+    python benchmarks/flexible.py --make          # references of scenes that have none
+
+References are written apart from the package: dielectrics are closed surfaces of their true
+thickness with the flux condition on each panel (``difficult_reference.py``), extrapolated from two
+meshes. A conducting cloth is one sheet of charge at its middle. The package is given what a
+simulator gives: some hundred vertices of a surface, made first in its flat or unloaded form.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flexible_scenes import (
+    COVER,
+    COVERED,
+    MATTER,
+    Cloth,
+    ball,
+    block,
+    cable_points,
+    grid_faces,
+    scenes,
+    soft_map,
+)
+from numpy.typing import NDArray
+
+import capsense as cs
+
+Array = NDArray[np.float64]
+Row = dict[str, Any]
+
+FILE = Path(__file__).parents[1] / "tests" / "data" / "flexible.json"
+FEMTO = 1e-15
+SCALES = 1.5, 1.0
+"""Panels of the two meshes."""
+ORDER = 1.5
+COUNTS = 0.03
+"""Entries of the matrix count from so much of the largest change on."""
+SIDES = 12
+"""Sides of a cable in the reference."""
+
+
+# -- what the package is given ---------------------------------------------------------------------
+
+
+def design_of(name: str, *, hard: bool = False) -> cs.Design:
+    """A design; ``hard`` makes its cover a layer, as references take it."""
+    if name != COVERED:
+        return cs.load_design(name)
+    text = (Path(__file__).parent / "flexible_covered.toml").read_text(encoding="utf-8")
+    if hard:
+        head, _ = text.split("[[cover]]")
+        head = head.replace("z = [-0.001, 0.0]", f"z = [-0.001, {COVER}]")
+        text = head.replace('name = "covered"', 'name = "hard"')
+    file = Path(__file__).parent / ("_hard.toml" if hard else "flexible_covered.toml")
+    if hard:
+        file.write_text(text, encoding="utf-8")
+    try:
+        return cs.load_design(file)
+    finally:
+        if hard:
+            file.unlink()
+
+
+def material_of(row: Row) -> cs.Material | str:
+    """What a body is made of."""
+    if row["kind"] == "dielectric" or row["matter"] in MATTER and row["kind"] == "dielectric":
+        return cs.Material(row["matter"], MATTER[row["matter"]])
+    return "steel"
+
+
+def surface_of(row: Row) -> cs.DeformableSurface:
+    """The scene's surface, as a simulator gives it: in its first form, then bent."""
+    options: Row = {
+        "material": material_of(row),
+        "grounding": "grounded" if row["kind"] == "grounded" else "floating",
+    }
+    if row["what"] == "cloth":
+        vertices, faces = Cloth(row).mesh()
+        out = cs.DeformableSurface(
+            Cloth(row).flat(), faces, thickness=row["thickness"], **options
+        )
+    elif row["what"] == "cable":
+        from capsense.adapters.meshes import tube, tube_faces
+
+        line = cable_points(row, 40)
+        straight = np.linspace([-0.5, 0, 0], [0.5, 0, 0], 41) * row["length"] + [0, 0, 0.2]
+        out = cs.DeformableSurface(
+            tube(straight, row["radius"]), tube_faces(len(line)), **options
+        )
+        vertices = tube(line, row["radius"])
+    else:
+        v, faces = ball(3) if row["shape"] == "ball" else block(3)
+        out = cs.DeformableSurface(v * row["size"] + [0, 0, 0.2], faces, **options)
+        vertices = soft_map(row)(v)
+    out.vertices = vertices
+    return out
+
+
+# -- references -----------------------------------------------------------------------------------
+
+
+class Empty:
+    """The matrix of a design's panels, factorised."""
+
+    def __init__(self, name: str, scale: float) -> None:
+        import scipy.linalg
+        from difficult_reference import square
+        from bem_reference import Panels
+        from near_reference import EDGE, Feature, Layout, sensor_panels, stops
+
+        design = design_of(name, hard=True)
+        layout = Layout(design)
+        features = []
+        for z, ends, width in layout.edges():
+            axis = int(abs(ends[1, 0] - ends[0, 0]) > 1e-9)
+            reach = np.sort(ends[:, 1 - axis])
+            features.append(Feature(axis, float(ends[0, axis]), *reach.tolist(), z, EDGE * width))
+        for layer in design.layers:
+            for axis in (0, 1):
+                for at in (layer.lower[axis], layer.upper[axis]):
+                    low, high = float(layer.lower[1 - axis]), float(layer.upper[1 - axis])
+                    least = 0.6 * float(layer.upper[2] - layer.lower[2])
+                    features.append(
+                        Feature(axis, float(at), low, high, float(layer.upper[2]), least)
+                    )
+        corners, owner, eps = sensor_panels(layout, features, stops(layout, None), scale)
+        self.floor = np.array([0, 0, design.domain.floor])
+        self.panels = Panels(corners - self.floor)
+        self.held = owner > -2
+        matrix = square(self.panels, self.held)
+        front, back = eps.T
+        at = np.flatnonzero(~self.held)
+        ratio = (front + back)[at] / (front - back)[at]
+        matrix[at, at] += 2 * math.pi * ratio * self.panels.area[at]
+        self.factor = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=False)
+        unit = np.zeros((len(self.panels), int(owner.max()) + 1))
+        driven = np.flatnonzero(owner >= 0)
+        unit[driven, owner[driven]] = self.panels.area[driven]
+        self.answer = scipy.linalg.lu_solve(self.factor, unit, check_finite=False)
+
+    def change(self, corners: Array, kind: str, eps: float) -> Array:
+        """ΔC [F] by one body; of a dielectric the panels close it, and face out."""
+        import scipy.linalg
+        from difficult_reference import filled, square
+        from bem_reference import Panels
+        from near_integrals import potentials
+        from near_reference import induced
+
+        body = Panels(corners - self.floor)
+        conducts = np.full(len(body), kind != "dielectric")
+        own = square(body, conducts)
+        if kind == "dielectric":
+            lost = 2 * math.pi * body.area - own.sum(axis=0)
+            worst = float(np.abs(lost / body.area).max())
+            if worst > 1.0:
+                raise ValueError(f"the surface is not closed: {worst:.2g}")
+            at = np.arange(len(body))
+            own[at, at] += lost + 2 * math.pi * (1 + eps) / (1 - eps) * body.area
+        right = filled(self.panels, self.held, body)
+        answer = scipy.linalg.lu_solve(self.factor, right, check_finite=False)
+        rows = filled(body, conducts, self.panels)
+        phi = rows @ self.answer
+        potential = phi
+        if kind == "dielectric":
+            potential = potentials(body, self.panels) @ self.answer
+        free = [body.area] if kind == "floating" else []
+        return induced(own - rows @ answer, phi, potential, free)
+
+
+@lru_cache(maxsize=1)
+def empty(name: str, scale: float) -> Empty:
+    """The empty sensor of a design; the last one is kept."""
+    return Empty(name, scale)
+
+
+def reference_panels(row: Row, scale: float) -> Array:
+    """Panels of a scene's body, (n, 4, 3) [m]."""
+    if row["what"] == "cloth":
+        cloth, t = Cloth(row), row["thickness"]
+        size = scale * min(max(0.9 * row["gap"], 3.4e-3), 5e-3)
+        n, m = (math.ceil(row[k] / size) for k in ("length", "width"))
+        if row["kind"] != "dielectric":
+            return triangles_of(cloth.grid(n, m).reshape(-1, 3), grid_faces(n, m))
+        top, bottom = (cloth.grid(n, m, off) for off in (t / 2, -t / 2))
+        faces = grid_faces(n, m)
+        parts = [triangles_of(top.reshape(-1, 3), faces),
+                 triangles_of(bottom.reshape(-1, 3), faces[:, ::-1])]  # fmt: skip
+        for up, low in ((top[0, ::-1], bottom[0, ::-1]), (top[-1], bottom[-1]),
+                        (top[:, 0], bottom[:, 0]), (top[::-1, -1], bottom[::-1, -1])):  # fmt: skip
+            parts.append(np.stack([low[:-1], low[1:], up[1:], up[:-1]], axis=1))
+        return np.concatenate(parts)
+    if row["what"] == "cable":
+        n = math.ceil(row["length"] / (scale * min(max(row["radius"], 2e-3), 4e-3)))
+        sides = round(SIDES / scale)
+        ring = 2 * math.pi / sides
+        grown = math.sqrt(ring / math.sin(ring))  # of equal area across
+        from capsense.adapters.meshes import tube, tube_faces
+
+        points = tube(cable_points(row, n), grown * row["radius"], sides)
+        return triangles_of(points, tube_faces(n + 1, sides))
+    level = 4 if scale == 1.0 else 3
+    v, f = ball(level) if row["shape"] == "ball" else block(level)
+    return triangles_of(soft_map(row)(v), f)
+
+
+def triangles_of(vertices: Array, faces: NDArray[np.int64]) -> Array:
+    """Triangles as panels of four corners."""
+    return vertices[faces][:, [0, 1, 2, 2]]
+
+
+def referenced(row: Row) -> Row:
+    """A scene with ΔC [fF], extrapolated from two meshes, and what that adds as its error."""
+    started, found, count = time.perf_counter(), [], 0
+    for scale in SCALES:
+        panels = reference_panels(row, scale)
+        eps = MATTER.get(row["matter"], 1.0)
+        found.append(empty(row["design"], 1.3).change(panels, row["kind"], eps))
+        count = len(panels)
+    coarse, fine = found
+    ratio = 2.0 if row["what"] == "soft" else SCALES[0] / SCALES[1]
+    best = fine + (fine - coarse) / (ratio**ORDER - 1)
+    largest = float(np.abs(best).max())
+    error = float(np.abs(best - fine).max()) / largest
+    return {**row, "delta_fF": [[float(f"{v:.5g}") for v in r] for r in best / FEMTO],
+            "error": round(error, 4), "panels": count,
+            "seconds": round(time.perf_counter() - started)}  # fmt: skip
+
+
+def make(only: str) -> None:
+    """Compute references of scenes that have none."""
+    old = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else []
+    known = {r["name"]: r for r in old}
+    rows = scenes()
+    for row in sorted(rows, key=lambda r: str(r["design"])):
+        found = known.get(row["name"])
+        if found is not None and all(
+            json.dumps(found[k]) == json.dumps(v) for k, v in row.items()
+        ):
+            continue
+        known.pop(row["name"], None)
+        if only in row["name"]:
+            known[row["name"]] = done = referenced(row)
+            print(f"{row['name']:52s} {np.max(np.abs(done['delta_fF'])):9.3f} fF, adds "
+                  f"{done['error']:.2%}, {done['panels']} panels, {done['seconds']} s", flush=True)  # fmt: skip
+        kept = [known[r["name"]] for r in rows if r["name"] in known]
+        FILE.write_text("[\n" + ",\n".join(map(json.dumps, kept)) + "\n]\n", encoding="utf-8")
+
+
+# -- measuring ------------------------------------------------------------------------------------
+
+
+def worst(found: Array, row: Row) -> float:
+    """Largest relative error of the entries that count."""
+    truth = FEMTO * np.array(row["delta_fF"])
+    m = len(truth)
+    counts = np.abs(truth) >= COUNTS * np.abs(truth).max()
+    return float(np.abs(found[:m, :m] / np.where(counts, truth, 1.0) - 1.0)[counts].max())
+
+
+def measure(only: str = "", preset: str = "standard") -> list[tuple[Row, float, float, int]]:
+    """Scenes, their errors, processor time of a step [s] and unknowns."""
+    out, sims = [], {}
+    for row in json.loads(FILE.read_text(encoding="utf-8")):
+        if only not in row["name"]:
+            continue
+        name = row["design"]
+        if name not in sims:
+            sims[name] = cs.Simulator(design_of(name), preset=preset)
+        sim, surface, times = sims[name], surface_of(row), []
+        vertices = surface.vertices
+        for _ in range(5):
+            surface.vertices = vertices + 0.0
+            start = time.process_time()
+            reading = sim.step(cs.Scene([surface.body()]))
+            times.append(time.process_time() - start)
+        out.append((row, worst(reading.delta, row), min(times), reading.stats.unknowns))
+    return out
+
+
+def main() -> None:
+    """Print the table, or make references."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--make", action="store_true")
+    parser.add_argument("--only", default="", help="part of a name")
+    parser.add_argument("--preset", default="standard")
+    given = parser.parse_args()
+    if given.make:
+        make(given.only)
+        return
+    print(f"largest error of entries above {COUNTS:.0%} of the largest; a step")
+    for row, error, seconds, unknowns in measure(given.only, given.preset):
+        print(f"{row['name']:52s} gap {1e3 * row['gap']:5.1f} mm {100 * error:7.1f} %"
+              f"   {1e3 * seconds:5.2f} ms  {unknowns:4d}   (reference {row['error']:.1%})",
+              flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
