@@ -101,7 +101,7 @@ def surface_of(row: Row) -> cs.DeformableSurface:
         )
         vertices = tube(line, row["radius"])
     else:
-        v, faces = ball(3) if row["shape"] == "ball" else block(3)
+        v, faces = ball(8) if row["shape"] == "ball" else block(8)
         out = cs.DeformableSurface(v * row["size"] + [0, 0, 0.2], faces, **options)
         vertices = soft_map(row)(v)
     out.vertices = vertices
@@ -116,9 +116,9 @@ class Empty:
 
     def __init__(self, name: str, scale: float) -> None:
         import scipy.linalg
-        from difficult_reference import square
+        from difficult_reference import EDGE, square
         from bem_reference import Panels
-        from near_reference import EDGE, Feature, Layout, sensor_panels, stops
+        from near_reference import Feature, Layout, sensor_panels, stops
 
         design = design_of(name, hard=True)
         layout = Layout(design)
@@ -189,7 +189,7 @@ def reference_panels(row: Row, scale: float) -> Array:
     """Panels of a scene's body, (n, 4, 3) [m]."""
     if row["what"] == "cloth":
         cloth, t = Cloth(row), row["thickness"]
-        size = scale * min(max(0.9 * row["gap"], 3.4e-3), 5e-3)
+        size = scale * min(max(0.9 * row["gap"], 4.2e-3), 6e-3)
         n, m = (math.ceil(row[k] / size) for k in ("length", "width"))
         if row["kind"] != "dielectric":
             return triangles_of(cloth.grid(n, m).reshape(-1, 3), grid_faces(n, m))
@@ -210,8 +210,8 @@ def reference_panels(row: Row, scale: float) -> Array:
 
         points = tube(cable_points(row, n), grown * row["radius"], sides)
         return triangles_of(points, tube_faces(n + 1, sides))
-    level = 4 if scale == 1.0 else 3
-    v, f = ball(level) if row["shape"] == "ball" else block(level)
+    parts = round(12 / scale)
+    v, f = ball(parts) if row["shape"] == "ball" else block(parts)
     return triangles_of(soft_map(row)(v), f)
 
 
@@ -229,8 +229,7 @@ def referenced(row: Row) -> Row:
         found.append(empty(row["design"], 1.3).change(panels, row["kind"], eps))
         count = len(panels)
     coarse, fine = found
-    ratio = 2.0 if row["what"] == "soft" else SCALES[0] / SCALES[1]
-    best = fine + (fine - coarse) / (ratio**ORDER - 1)
+    best = fine + (fine - coarse) / ((SCALES[0] / SCALES[1]) ** ORDER - 1)
     largest = float(np.abs(best).max())
     error = float(np.abs(best - fine).max()) / largest
     return {**row, "delta_fF": [[float(f"{v:.5g}") for v in r] for r in best / FEMTO],
@@ -243,7 +242,7 @@ def make(only: str) -> None:
     old = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else []
     known = {r["name"]: r for r in old}
     rows = scenes()
-    for row in sorted(rows, key=lambda r: str(r["design"])):
+    for row in sorted(rows, key=lambda r: (str(r["design"]), r["kind"])):
         found = known.get(row["name"])
         if found is not None and all(
             json.dumps(found[k]) == json.dumps(v) for k, v in row.items()

@@ -96,39 +96,38 @@ def soft_map(row: Row) -> Callable[[Array], Array]:
     return place
 
 
-def ball(level: int) -> tuple[Array, NDArray[np.int64]]:
-    """A unit ball of 20 · 4^level triangles."""
+def ball(parts: int) -> tuple[Array, NDArray[np.int64]]:
+    """A unit ball of 20 parts² triangles."""
     g = (1 + 5**0.5) / 2
     v = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g),
                   (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)])  # fmt: skip
     f = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
                   (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
                   (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])  # fmt: skip
-    return divided(v / np.linalg.norm(v, axis=1)[:, None], f, level, round_=True)
+    v, f = divided(v / np.linalg.norm(v, axis=1)[:, None], f, parts)
+    return v / np.linalg.norm(v, axis=1)[:, None], f
 
 
-def block(level: int) -> tuple[Array, NDArray[np.int64]]:
-    """The block of half edges 1, 12 · 4^level triangles."""
+def block(parts: int) -> tuple[Array, NDArray[np.int64]]:
+    """The block of half edges 1, 12 parts² triangles."""
     v = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     f = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return divided(v, f, level, round_=False)
+    return divided(v, f, parts)
 
 
-def divided(v: Array, f: NDArray[np.int64], level: int, *,
-            round_: bool) -> tuple[Array, NDArray[np.int64]]:  # fmt: skip
-    """Triangles cut into four, so many times."""
-    for _ in range(level):
-        edges = np.sort(f[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        unique, place = np.unique(edges, axis=0, return_inverse=True)
-        middle = v[unique].mean(axis=1)
-        if round_:
-            middle /= np.linalg.norm(middle, axis=1)[:, None]
-        a, b, c = (len(v) + place.reshape(-1, 3)).T
-        v = np.concatenate([v, middle])
-        x, y, z = f.T
-        f = np.concatenate([np.stack(t, axis=1) for t in ((x, a, c), (a, y, b), (c, b, z), (a, b, c))])
-    return v, f
+def divided(v: Array, f: NDArray[np.int64], parts: int) -> tuple[Array, NDArray[np.int64]]:
+    """Triangles whose edges are cut into so many parts."""
+    steps = [(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]
+    at = {step: k for k, step in enumerate(steps)}
+    share = np.array([(parts - i - j, i, j) for i, j in steps]) / parts
+    points = np.einsum("sk,fkx->fsx", share, v[f])
+    small = [(at[i, j], at[i + 1, j], at[i, j + 1]) for i, j in steps if i + j < parts]
+    small += [(at[i + 1, j], at[i + 1, j + 1], at[i, j + 1]) for i, j in steps if i + j < parts - 1]
+    faces = (len(steps) * np.arange(len(f))[:, None, None] + np.array(small)).reshape(-1, 3)
+    points = points.reshape(-1, 3)
+    _, first, place = np.unique(np.round(points, 9), axis=0, return_index=True, return_inverse=True)
+    return points[first], place.reshape(-1)[faces]
 
 
 COVERED, COVER = "covered", 2e-3
@@ -209,7 +208,7 @@ def scenes(seed: int = 11) -> list[Row]:
             "pressed": between(0.0, 0.35), "gap": log(*gap),
             "at": [between(-0.02, 0.02), between(-0.02, 0.02)], "lowest": 0.0,
         }  # fmt: skip
-        v = (ball if shape == "ball" else block)(5)[0]
+        v = (ball if shape == "ball" else block)(32)[0]
         row["gap"] += COVER if design == COVERED else 0.0
         row["lowest"] = float(f"{(soft_map(row)(v)[:, 2] - row['gap']).min():.6g}")
         out.append(row)

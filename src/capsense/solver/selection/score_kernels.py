@@ -105,7 +105,8 @@ def _energy(body, k):
 @kernel
 def _net_energy(body):
     """Energy of a body's net charge [1/m]."""
-    return doubles(body.own)[0] / body.scale + body.ground_elastance
+    inside = 1.0 + body.polarization_stiffness if body.layer > 0.0 else 1.0
+    return inside * doubles(body.own)[0] / body.scale + body.ground_elastance
 
 
 @kernel

@@ -12,6 +12,7 @@ from capsense.field.green_kernels import Green
 from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.gap.gap_kernels import fabric_change, near_bodies, press_out
 from capsense.solver.gap.series_kernels import in_series_lossy
+from capsense.solver.interaction.layer_kernels import face_charges, faces_of
 from capsense.solver.system.step import NOTHING, SERIES, Solution, estimate, prepared, solve_lifted
 from capsense.solver.system.system_kernels import COARSE, GAIN, factorise, leaf_charges
 
@@ -41,6 +42,7 @@ def solve_lossy(
     fabric = np.zeros((green.terminals, green.terminals))
     fabric_change(records, green, fabric)
     records = records.copy()
+    ties = np.where(records["layer"] > 0.0, 0.0, ties)  # of layers of dipoles
     records["inverse_susceptibility"] = np.abs(inverse_susceptibility)
     near = near_bodies(records, green, True)
     press_out(records, near, green)
@@ -113,6 +115,8 @@ def _lossy_lifted(
         COARSE * (functions.panel_end_fraction[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
     )
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
+    leaves, first = faces_of(leaves)
+    charge = face_charges(charge, first)
     delta, left = 0.5 * (delta + delta.T), np.ascontiguousarray(left.real)
     error = estimate(np.ascontiguousarray(delta.real), left, coarse, shift, green.electrodes)
     return Solution(

@@ -31,6 +31,12 @@ from capsense.solver.gap.gap_kernels import (
 )
 from capsense.solver.gap.series_kernels import difference, in_series
 from capsense.solver.gradients.gradient_kernels import jacobian
+from capsense.solver.interaction.layer_kernels import (
+    face_charges,
+    faces_of,
+    joined_pairs,
+    joined_rows,
+)
 from capsense.solver.interaction.pair_kernels import bound_images, leaf_pairs
 from capsense.solver.interaction.subpanel_kernels import add_parts
 from capsense.solver.placement.placement_kernels import ActiveClusters, leaf_rows, placed
@@ -125,8 +131,11 @@ def prepared(
     leaves = placed(bodies, cut, green)
     hold_apart(bodies, facing, leaves, green)
     cut, leaves = truncate_to_domain(cut, leaves)
-    rows = leaf_rows(leaves.points, leaves.outside_fraction, green)
-    pairs = leaf_pairs(leaves, green.floor)
+    faces, first = faces_of(leaves)
+    rows = leaf_rows(faces.points, faces.outside_fraction, green)
+    pairs = leaf_pairs(faces, green.floor)
+    if first[-1] > leaves.points.shape[0]:
+        rows, pairs = joined_rows(rows, first), joined_pairs(pairs, first)
     add_parts(bodies, cut, leaves, pairs)
     bound_images(leaves, rows, pairs, green)
     functions = functions_of(bodies, cut, leaves.outside_fraction)
@@ -247,6 +256,8 @@ def solve_lifted(
         system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
+    leaves, first = faces_of(leaves)
+    charge = face_charges(charge, first)
     weights, doubt = np.zeros((m, m)), 0.0
     if near.any() or tied:
         thin, plain = slenderness(bodies, lifted, green.gap.validity), delta.copy()
