@@ -47,7 +47,7 @@ SCALES = 1.5, 1.0
 ORDER = 1.5
 COUNTS = 0.03
 """Entries of the matrix count from so much of the largest change on."""
-SIDES = 12
+SIDES = 10
 """Sides of a cable in the reference."""
 
 
@@ -189,7 +189,7 @@ def reference_panels(row: Row, scale: float) -> Array:
     """Panels of a scene's body, (n, 4, 3) [m]."""
     if row["what"] == "cloth":
         cloth, t = Cloth(row), row["thickness"]
-        size = scale * min(max(0.9 * row["gap"], 4.2e-3), 6e-3)
+        size = scale * min(max(row["gap"], 5e-3), 7e-3)
         n, m = (math.ceil(row[k] / size) for k in ("length", "width"))
         if row["kind"] != "dielectric":
             return triangles_of(cloth.grid(n, m).reshape(-1, 3), grid_faces(n, m))
@@ -202,7 +202,7 @@ def reference_panels(row: Row, scale: float) -> Array:
             parts.append(np.stack([low[:-1], low[1:], up[1:], up[:-1]], axis=1))
         return np.concatenate(parts)
     if row["what"] == "cable":
-        n = math.ceil(row["length"] / (scale * min(max(row["radius"], 2e-3), 4e-3)))
+        n = math.ceil(row["length"] / (scale * min(max(1.2 * row["radius"], 3e-3), 5e-3)))
         sides = round(SIDES / scale)
         ring = 2 * math.pi / sides
         grown = math.sqrt(ring / math.sin(ring))  # of equal area across
@@ -210,7 +210,7 @@ def reference_panels(row: Row, scale: float) -> Array:
 
         points = tube(cable_points(row, n), grown * row["radius"], sides)
         return triangles_of(points, tube_faces(n + 1, sides))
-    parts = round(12 / scale)
+    parts = round(9 / scale)
     v, f = ball(parts) if row["shape"] == "ball" else block(parts)
     return triangles_of(soft_map(row)(v), f)
 
@@ -226,7 +226,7 @@ def referenced(row: Row) -> Row:
     for scale in SCALES:
         panels = reference_panels(row, scale)
         eps = MATTER.get(row["matter"], 1.0)
-        found.append(empty(row["design"], 1.3).change(panels, row["kind"], eps))
+        found.append(empty(row["design"], 1.6).change(panels, row["kind"], eps))
         count = len(panels)
     coarse, fine = found
     best = fine + (fine - coarse) / ((SCALES[0] / SCALES[1]) ** ORDER - 1)

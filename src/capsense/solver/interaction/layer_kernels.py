@@ -3,18 +3,29 @@
 A leaf of a layer has a charge q on its front and -q on its back, a thickness t apart. What it meets
 of the design and of other bodies is the difference of both faces. The dipoles of one sheet do not
 meet each other beyond what each has in itself: an even layer makes no field outside. Its charge
-takes 4π t / S of energy on an area S, and 1 / (eps - 1) times that for what polarises it.
+takes 4π t / S of energy on an area S, and 1 / (eps - 1) times that for what polarises it. Charge
+functions of different clusters thus have no energy between them, and each that is left out lacks
+what it takes from the field alone: :func:`fine_layers` adds that of all of them.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
+from capsense._simd import doubles
+from capsense.field.face_kernels import WALL_FADE_LENGTH, keep_off, smooth
 from capsense.solver.placement.placement_kernels import ActiveClusters
+from capsense.solver.selection.evaluation_kernels import far_potentials
+
+GAIN = 1.3
+"""Weight of the functions directly below the cut, see ``system_kernels.GAIN``."""
+_ARM = 0.2
+"""Fields across a piece are differences over so much of its width, or its thickness."""
 
 
 @kernel
@@ -100,3 +111,84 @@ def face_charges(charge, first):
             for k in range(charge.shape[1]):
                 out[i, k] = sign * charge[j, k]
     return out
+
+
+@compiled
+def fine_layers(bodies, functions, phi, green):
+    """What functions of layers outside of the system add, in the field of the design alone.
+
+    It is the integral of t (1 - 1/eps) E_i E_j / (4π) over each sheet, E_i the field across it with
+    terminal i at 1 V, less what the functions have of that which the system and its estimate hold.
+
+    Args:
+        bodies: Records of :data:`~capsense.solver.tree.rigid.BODY`, shape (b,).
+        functions: The charge functions.
+        phi: φ⁰ of these, shape (f, lead).
+        green: Green's function of the design.
+
+    Returns:
+        The change of the Maxwell matrix times eps / (eps - 1) [m], shape (b, m, m).
+    """
+    m = green.terminals
+    out = np.zeros((bodies.shape[0], m, m))
+    for b in range(bodies.shape[0]):
+        body = bodies[b]
+        if body.layer == 0.0:
+            continue
+        own = doubles(body.own)
+        for f in range(functions.body.shape[0]):
+            if functions.body[f] != b:
+                continue
+            fade, above = functions.fade[f], functions.parent_fade[f]
+            weight = fade + GAIN * (1.0 - fade) * (1.0 - (1.0 - above) ** 4)
+            weight *= body.scale / own[functions.number[f]]
+            for i in range(m):
+                for j in range(i + 1):
+                    out[b, i, j] -= weight * phi[f, i] * phi[f, j]
+        _add_pieces(body, green, out[b])
+        for i in range(m):
+            for j in range(i):
+                out[b, j, i] = out[b, i, j]
+    return out
+
+
+@compiled
+def _add_pieces(body, green, out):
+    """Add the integral over a sheet, from three points of each piece; the lower half, (m, m)."""
+    count, space, pieces = 3 * body.n, green.space, doubles(body.pieces)
+    front, back = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    weight, inner, rows = np.zeros(count), np.empty(count), np.empty(count, np.int64)
+    point, normal, found = np.empty((1, 3)), np.empty(3), 0
+    for c in range(count):
+        o, q = 13 * (c // 3), 3 * (c % 3)
+        area = pieces[o + 12] * body.scale * body.scale
+        arm = max(body.layer * body.scale, _ARM * math.sqrt(area))
+        beyond = 0.0
+        for i in range(3):
+            point[0, i], normal[i] = body.position[i], 0.0
+            for k in range(3):
+                turn = body.rotation[i, k]
+                point[0, i] += body.scale * turn * pieces[o + q + k]
+                normal[i] += turn * pieces[o + 9 + k]
+            low, high = space.active_bounds[0, i], space.active_bounds[1, i]
+            beyond += max(low - point[0, i], point[0, i] - high, 0.0) ** 2
+        share = 1.0 - smooth(math.sqrt(beyond) / (WALL_FADE_LENGTH * space.extent))
+        if share == 0.0:
+            continue
+        if space.has_face:
+            keep_off(point, space)
+        for i in range(3):
+            front[found, i] = point[0, i] + 0.5 * arm * normal[i]
+            back[found, i] = point[0, i] - 0.5 * arm * normal[i]
+        weight[found] = body.layer * body.scale * area / (12.0 * math.pi * arm * arm)
+        inner[found], rows[found] = share, found
+        found += 1
+    one = np.zeros((found, green.phi_columns), np.float32)
+    two = np.zeros((found, green.phi_columns), np.float32)
+    far_potentials(front[:found], rows[:found], inner[:found], green, one)
+    far_potentials(back[:found], rows[:found], inner[:found], green, two)
+    for c in range(found):
+        for i in range(out.shape[0]):
+            field = weight[c] * float(one[c, i] - two[c, i])
+            for j in range(i + 1):
+                out[i, j] += field * float(one[c, j] - two[c, j])

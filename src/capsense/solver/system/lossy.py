@@ -12,7 +12,7 @@ from capsense.field.green_kernels import Green
 from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.gap.gap_kernels import fabric_change, near_bodies, press_out
 from capsense.solver.gap.series_kernels import in_series_lossy
-from capsense.solver.interaction.layer_kernels import face_charges, faces_of
+from capsense.solver.interaction.layer_kernels import face_charges, faces_of, fine_layers
 from capsense.solver.system.step import NOTHING, SERIES, Solution, estimate, prepared, solve_lifted
 from capsense.solver.system.system_kernels import COARSE, GAIN, factorise, leaf_charges
 
@@ -79,6 +79,8 @@ def _lossy_lifted(
     plain["ground_elastance"], plain["inverse_susceptibility"] = 0.0, 0.0
     none = facing_of(plain[:0])
     cut, leaves, functions, system = prepared(plain, green, threshold, width, none, plain)
+    fine = fine_layers(plain, functions, system.phi, green)
+    fine = np.einsum("b,bij->ij", 1.0 / (1.0 + inverse_susceptibility), fine)
     plain["inverse_susceptibility"] = 1.0
     inside = prepared(plain, green, threshold, width, none, plain)[3]
     phi, real, below, own = system
@@ -111,6 +113,7 @@ def _lossy_lifted(
     x = np.zeros((len(fade), m), complex)
     x[:n], x[n:] = solved, extra[n:]
     delta = _product(phi[:n, :m].T, solved) + left
+    delta, left = delta + fine, left + fine
     coarse = (
         COARSE * (functions.panel_end_fraction[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
     )

@@ -34,6 +34,7 @@ from capsense.solver.gradients.gradient_kernels import jacobian
 from capsense.solver.interaction.layer_kernels import (
     face_charges,
     faces_of,
+    fine_layers,
     joined_pairs,
     joined_rows,
 )
@@ -252,6 +253,7 @@ def solve_lifted(
     if facing.pairs == 0:
         scored = bodies
     cut, leaves, functions, system = prepared(bodies, green, threshold, width, facing, scored)
+    fine = fine_layers(bodies, functions, system.phi, green)
     if nodes > 0:
         system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
@@ -273,6 +275,13 @@ def solve_lifted(
             plain = congruent(before, plain, capacitance)
             for i in range(green.electrodes):
                 doubt = max(doubt, thin * abs(delta[i, i] - plain[i, i]))
+    for b in range(bodies.shape[0]):
+        if bodies[b].layer > 0.0:
+            part = 1.0 / (1.0 + bodies[b].inverse_susceptibility)
+            for i in range(m):
+                for j in range(m):
+                    delta[i, j] += part * fine[b, i, j]
+                    left[i, j] += part * fine[b, i, j]
     error = estimate(delta, left, coarse[:m], shift, green.electrodes) + doubt
     return Solution(
         delta[:m, :m],
@@ -299,14 +308,13 @@ def slopes_of(
     """How the Maxwell matrix changes with the pose of each body, as ``gradient_kernels.jacobian``.
 
     Bodies near the design are lifted, and pressed out of it. What that changes is not in the
-    adjoint, so that their slopes are central differences of the step itself, 12 more of it.
+    adjoint, so that their slopes are central differences of the step itself, 12 more of it; so are
+    those of layers of dipoles.
     """
     out, m = jacobian(solution, bodies, green), green.terminals
-    if not solution.near.any():
-        return out
     moved = bodies.copy()
     for b in range(bodies.shape[0]):
-        if not solution.near[b]:
+        if not solution.near[b] and bodies[b].layer == 0.0:
             continue
         step = DIFFERENCE * green.gap.validity
         arm = max(extent_of_body(bodies[b]), green.gap.validity)

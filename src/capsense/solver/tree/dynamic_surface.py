@@ -345,13 +345,14 @@ class Layer(DynamicBody):
     """
 
     def __init__(self, sheet: DynamicBody) -> None:
-        assert sheet.pieces is not None and sheet.pieces.normals is not None
+        pieces = sheet.pieces
+        assert pieces is not None and pieces.normals is not None and pieces.corners is not None
         self.sheet, self.pieces, self._sheet = 0.0, None, sheet
         self._panel, self._extent, self._center = sheet._panel, sheet._extent, sheet._center
         self.capacitance = sheet.capacitance
         children, area, split_ = sheet._children, sheet._charge, sheet._panel < 0
         self._normals = np.empty((len(children), 3))
-        self._normals[~split_] = sheet.pieces.normals[sheet._panel[~split_]]
+        self._normals[~split_] = pieces.normals[sheet._panel[~split_]]
         tree_kernels.means(children, area, self._normals)
         across = 4.0 * math.pi * sheet.sheet
         self._own = np.empty((len(children) + 1) // 2)
@@ -360,4 +361,9 @@ class Layer(DynamicBody):
         self._own[sheet._function[split_]] = across * (1.0 / area[first] + 1.0 / area[second])
         self.record = record = sheet.record.copy()
         record["sheet"], record["inside"], record["layer"] = 0.0, 0.0, sheet.sheet
-        record["own"], record["normals"] = self._own.ctypes.data, self._normals.ctypes.data
+        inner = pieces.centers[:, None] + 0.5 * (pieces.corners - pieces.centers[:, None])
+        self._pieces = np.concatenate(  # which are good to the second order, at Gauss points
+            [inner.reshape(-1, 9), pieces.normals, pieces.areas[:, None]], axis=1
+        )
+        for name in ("own", "normals", "pieces"):
+            record[name] = getattr(self, f"_{name}").ctypes.data
