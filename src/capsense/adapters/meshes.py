@@ -329,7 +329,24 @@ def tube_faces(count: int, sides: int = _SIDES) -> Faces:
         np.stack([low, low_next, high_next], axis=-1).reshape(-1, 3),
         np.stack([low, high_next, high], axis=-1).reshape(-1, 3),
     ]
-    for ring, middle, turn in ((a[0], count * sides, 1), (a[-1], count * sides + 1, -1)):
-        fan = np.stack([np.full(sides, middle), np.roll(ring, -turn), ring], axis=-1)
-        parts.append(fan if turn > 0 else fan[:, [0, 1, 2]])
+    for ring, middle, way in ((a[0], count * sides, -1), (a[-1], count * sides + 1, 1)):
+        parts.append(np.stack([np.full(sides, middle), np.roll(ring, way), ring], axis=-1))
     return np.concatenate(parts)
+
+
+def path_order(lines: NDArray[np.integer[Any]]) -> NDArray[np.int64] | None:
+    """Points of line segments (n, 2) from one end to the other; None where they are no open path."""
+    beside: dict[int, list[int]] = {}
+    for a, b in lines.tolist():
+        beside.setdefault(a, []).append(b)
+        beside.setdefault(b, []).append(a)
+    ends = [k for k, others in beside.items() if len(others) == 1]
+    if len(ends) != 2 or len(beside) != len(lines) + 1:
+        return None
+    order = [min(ends)]
+    while len(order) < len(beside):
+        ahead = [k for k in beside[order[-1]] if len(order) == 1 or k != order[-2]]
+        if len(ahead) != 1:
+            return None
+        order.append(ahead[0])
+    return np.array(order, dtype=np.int64)

@@ -13,7 +13,7 @@ from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.gap.gap_kernels import fabric_change, near_bodies, press_out
 from capsense.solver.gap.series_kernels import in_series_lossy
 from capsense.solver.interaction.layer_kernels import face_charges, faces_of, fine_layers
-from capsense.solver.system.step import NOTHING, SERIES, Solution, estimate, prepared, solve_lifted
+from capsense.solver.system.step import SERIES, Solution, estimate, only, prepared, solve_lifted
 from capsense.solver.system.system_kernels import COARSE, GAIN, factorise, leaf_charges
 
 
@@ -50,19 +50,19 @@ def solve_lossy(
     if not near.any():
         return found._replace(delta=found.delta + fabric)
 
-    def real(value: float, outline: bool = True) -> NDArray[Any]:
-        some = records.copy()
-        some["inverse_susceptibility"][near] = value
-        some["outline"][near] *= outline
-        return np.asarray(solve_lifted(some, green, threshold, width, False).delta)
-
-    rest, off = np.zeros_like(found.delta), np.zeros_like(found.delta.real)
+    alone = only(records, near)
+    own = found.delta
     if not near.all():
-        gone = np.where(near, NOTHING, inverse_susceptibility)
-        rest = _lossy_lifted(records, ties, gone, green, threshold, width).delta
-        off = real(NOTHING)
-    delta = rest + in_series_lossy(found.delta - rest, real(0.0, False) - off, real(0.0) - off)
-    doubt = SERIES * np.abs(np.diag(delta - found.delta))[: green.electrodes].max(initial=0.0)
+        own = _lossy_lifted(
+            alone, ties[near], inverse_susceptibility[near], green, threshold, width
+        ).delta
+    alone["inverse_susceptibility"] = 0.0
+    high = np.asarray(solve_lifted(alone, green, threshold, width, False).delta)
+    alone["outline"] = 0
+    low = np.asarray(solve_lifted(alone, green, threshold, width, False).delta)
+    change = in_series_lossy(own, low, high) - own
+    delta = found.delta + change
+    doubt = SERIES * np.abs(np.diag(change))[: green.electrodes].max(initial=0.0)
     return found._replace(delta=delta + fabric, error=found.error + float(doubt), near=near)
 
 
@@ -113,7 +113,7 @@ def _lossy_lifted(
     x = np.zeros((len(fade), m), complex)
     x[:n], x[n:] = solved, extra[n:]
     delta = _product(phi[:n, :m].T, solved) + left
-    delta, left = delta + fine, left + fine
+    delta, left = delta + fine, left + SERIES * fine
     coarse = (
         COARSE * (functions.panel_end_fraction[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
     )

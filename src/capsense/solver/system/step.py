@@ -62,8 +62,6 @@ from capsense.solver.system.system_kernels import (
 
 DIFFERENCE = 3e-3
 """Step of central differences, over the validity distance."""
-NOTHING = 1e9
-"""Softness 1 / (eps - 1) of what is as good as not there."""
 SERIES = 0.1
 """Assumed relative error of what near dielectrics add."""
 FIELD_ERROR = 0.015
@@ -194,29 +192,22 @@ def _solve(
     press_out(bodies, soft, green)
     found = solve_lifted(bodies, green, threshold, width, adjoint)
     m, plain = green.terminals, np.bool_(False)  # the literal would compile another version
-    rest = np.zeros((m, m))
-    stiff = bodies.copy()
+    alone = only(bodies, soft)
+    own = found.delta
     if not soft.all():
-        for b in range(bodies.shape[0]):
-            if soft[b]:
-                stiff[b].inverse_susceptibility = NOTHING
-        rest = solve_lifted(stiff, green, threshold, width, plain).delta
-    for b in range(bodies.shape[0]):
-        if soft[b]:
-            stiff[b].inverse_susceptibility = 0.0
-    high = solve_lifted(stiff, green, threshold, width, plain).delta
-    for b in range(bodies.shape[0]):
-        if soft[b]:
-            stiff[b].outline = 0  # lifted, and nothing is added
-    low = solve_lifted(stiff, green, threshold, width, plain).delta
-    delta = in_series(difference(found.delta, rest), difference(low, rest), difference(high, rest))
-    doubt = 0.0
+        own = solve_lifted(alone, green, threshold, width, plain).delta
+    for b in range(alone.shape[0]):
+        alone[b].inverse_susceptibility = 0.0
+    high = solve_lifted(alone, green, threshold, width, plain).delta
+    for b in range(alone.shape[0]):
+        alone[b].outline = 0  # lifted, and nothing is added
+    low = solve_lifted(alone, green, threshold, width, plain).delta
+    change, doubt = difference(in_series(own, low, high), own), 0.0
     for i in range(m):
-        before = found.delta[i, i]
         for j in range(m):
-            found.delta[i, j] = delta[i, j] + rest[i, j]
+            found.delta[i, j] += change[i, j]
         if i < green.electrodes:
-            doubt = max(doubt, SERIES * abs(found.delta[i, i] - before))
+            doubt = max(doubt, SERIES * abs(change[i, i]))
     return Solution(
         found.delta,
         found.residual_correction,
@@ -233,6 +224,20 @@ def _solve(
         found.node,
         found.weights,
     )
+
+
+@compiled
+def only(bodies: NDArray[np.void], wanted: NDArray[np.bool_]) -> NDArray[np.void]:
+    """Some bodies, by themselves: what a lift changes of near dielectrics is local."""
+    out, first, count = bodies.copy(), np.full(bodies.shape[0], -1), 0
+    for b in range(bodies.shape[0]):
+        if wanted[b]:
+            out[count] = bodies[b]
+            if first[bodies[b].group] < 0:
+                first[bodies[b].group] = count
+            out[count].group = first[bodies[b].group]
+            count += 1
+    return out[:count]
 
 
 @compiled
@@ -281,7 +286,7 @@ def solve_lifted(
             for i in range(m):
                 for j in range(m):
                     delta[i, j] += part * fine[b, i, j]
-                    left[i, j] += part * fine[b, i, j]
+                    left[i, j] += SERIES * part * fine[b, i, j]
     error = estimate(delta, left, coarse[:m], shift, green.electrodes) + doubt
     return Solution(
         delta[:m, :m],
