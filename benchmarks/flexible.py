@@ -243,6 +243,7 @@ def reference_panels(row: Row, scale: float) -> Array:
         size = scale * min(max(row["gap"], 5e-3), 7e-3)
         n, m = (math.ceil(row[k] / size) for k in ("length", "width"))
         if row["kind"] != "dielectric":
+            n, m = 2 * n, 2 * m
             return triangles_of(cloth.grid(n, m).reshape(-1, 3), grid_faces(n, m))
         top, bottom = (cloth.grid(n, m, off) for off in (t / 2, -t / 2))
         faces = grid_faces(n, m)

@@ -19,13 +19,13 @@ from capsense.humans import Build
 from capsense.humans.formats import mjcf_body
 from capsense.reproduce.limb_worlds import SPEED, course
 
-GAP = 0.011
+GAP = 0.015
 """From the electrodes to the skin below their middle [m]."""
-STRETCHED = 0.015
+STRETCHED = 0.021
 """From the electrodes to the cloth where the frame holds it [m]."""
-COUNT, PITCH = 9, 0.0135
+COUNT, PITCH = 10, 0.013
 """Vertices along each side of the cloth, and their distance [m]."""
-WAY = 0.16
+WAY = 0.12
 """Along the forearm [m]."""
 RATE = 10.0
 """Readings per second [Hz]."""
@@ -41,8 +41,7 @@ def model() -> mujoco.MjModel:
     """The forearm, and the tool with the cloth in its frame, which looks down."""
     place = course(Build("male", percentile=50), "arm")
     arm = mjcf_body(place.limb, place.frame, damping=1e3)
-    side = range(COUNT)
-    rim = [COUNT * i + j for i in side for j in side if {i, j} & {0, COUNT - 1}]
+    sides = [COUNT * i + j for i in range(COUNT) for j in (0, COUNT - 1)]  # along the arm
     out = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep="0.002" gravity="0 0 0" integrator="discrete"/>'
         f'<size memory="64M"/><worldbody>{arm}'
@@ -51,14 +50,14 @@ def model() -> mujoco.MjModel:
         '<site name="pad" euler="180 0 0"/>'
         f'<flexcomp name="washcloth" type="grid" dim="2" count="{COUNT} {COUNT} 1" '
         f'spacing="{PITCH} {PITCH} {PITCH}" pos="0 0 {-STRETCHED}" radius="0.001" mass="0.05">'
-        '<elasticity young="1e5" poisson="0.2" thickness="0.001" elastic2d="stretch"/>'
+        '<elasticity young="1e5" poisson="0.2" thickness="0.001" elastic2d="both"/>'
         '<contact selfcollide="none" solref="0.01 1"/>'
-        f'<pin id="{" ".join(map(str, rim))}"/></flexcomp></body></worldbody><actuator>'
+        f'<pin id="{" ".join(map(str, sides))}"/></flexcomp></body></worldbody><actuator>'
         '<position joint="along" kp="2e4" kv="400"/><position joint="up" kp="2e4" kv="400"/>'
         "</actuator></mujoco>"
     )
     out.jnt_stiffness[: len(place.limb.joints)] = 2e3  # the person keeps the arm where it is
-    out.dof_damping[out.nv - 3 * (COUNT - 2) ** 2 :] = 0.02  # cloth does not swing
+    out.dof_damping[out.nv - 3 * COUNT * (COUNT - 2) :] = 0.02  # cloth does not swing
     return out
 
 
