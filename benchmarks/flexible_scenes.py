@@ -162,22 +162,27 @@ def scenes(seed: int = 11) -> list[Row]:
         })  # fmt: skip
 
     for design, matter, gap, fold in (
-        ("six_patch", "cotton", (3e-3, 6e-3), False), ("six_patch", "cotton", (8e-3, 2e-2), True),
+        ("six_patch", "cotton", (3e-3, 6e-3), False),
+        ("six_patch", "cotton", (8e-3, 2e-2), True),
         ("six_patch", "polyester", (2e-2, 6e-2), False),
         ("six_patch", "damp cloth", (4e-3, 1e-2), False),
         ("six_patch", "wet cloth", (5e-3, 2e-2), True),
         ("six_patch", "wet cloth", (4e-2, 1e-1), False),
-        ("patch", "polyester", (5e-3, 1e-2), False), ("patch", "wet cloth", (4e-3, 1e-2), False),
+        ("patch", "polyester", (5e-3, 1e-2), False),
+        ("patch", "wet cloth", (4e-3, 1e-2), False),
     ):
         cloth(design, "dielectric", matter, gap, fold)
     for design, kind, gap, fold in (
-        ("six_patch", "grounded", (3e-3, 1e-2), False), ("six_patch", "floating", (5e-3, 2e-2), False),
+        ("six_patch", "grounded", (3e-3, 1e-2), False),
+        ("six_patch", "floating", (5e-3, 2e-2), False),
         ("patch", "grounded", (5e-3, 2e-2), True),
     ):
         cloth(design, kind, "textile", gap, fold)
     for design, kind, gap in (
-        ("six_patch", "grounded", (2e-3, 6e-3)), ("six_patch", "floating", (3e-3, 1e-2)),
-        ("patch", "grounded", (5e-3, 2e-2)), ("six_patch", "dielectric", (3e-3, 8e-3)),
+        ("six_patch", "grounded", (2e-3, 6e-3)),
+        ("six_patch", "floating", (3e-3, 1e-2)),
+        ("patch", "grounded", (5e-3, 2e-2)),
+        ("six_patch", "dielectric", (3e-3, 8e-3)),
     ):
         out.append({
             "what": "cable", "design": design, "kind": kind,

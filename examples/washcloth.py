@@ -140,7 +140,9 @@ def record() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     return np.array(times), np.array(contacts), {k: np.array(v) for k, v in changes.items()}
 
 
-def draw(file: Path, times: np.ndarray, contacts: np.ndarray, changes: dict[str, np.ndarray]) -> None:
+def draw(
+    file: Path, times: np.ndarray, contacts: np.ndarray, changes: dict[str, np.ndarray]
+) -> None:
     """Six panels as the electrodes lie, three curves each; grey where the cloth is in contact."""
     import matplotlib
 

@@ -12,4 +12,4 @@ from capsense.solver.placement.placement_kernels import ActiveClusters
 def plain_leaves(*fields: Any) -> ActiveClusters:
     """Leaves from their fields ``points`` to ``within``."""
     count = len(fields[0])
-    return ActiveClusters(*fields, np.full((count, 2), -1), np.ones(count))
+    return ActiveClusters(*fields, np.full((count, 2), -1), np.ones(count), np.zeros((count, 3)))

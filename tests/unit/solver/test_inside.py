@@ -67,7 +67,9 @@ def test_welded_and_separate_vertices_agree() -> None:
     """Soft bodies of PyBullet have three vertices for every triangle."""
     v, f = strip(8)
     faces = np.arange(3 * len(f)).reshape(-1, 3)
-    one, other = (table_of(RestSurface(*m, THICKNESS)) for m in ((v, f), (v[f].reshape(-1, 3), faces)))
+    one, other = (
+        table_of(RestSurface(*m, THICKNESS)) for m in ((v, f), (v[f].reshape(-1, 3), faces))
+    )
     assert one is not None and other is not None
     np.testing.assert_allclose(other, one, rtol=1e-4, atol=1e-4 * float(one.max()))
 
