@@ -5,11 +5,10 @@
     python benchmarks/flexible.py --make          # references of scenes that have none
 
 References are written apart from the package, with all of the sensor's boundary elements
-(``near_reference.py``), and extrapolated from two meshes. Soft bodies and cables of a dielectric are
-closed surfaces with the flux condition on each panel. Cloth of a dielectric has charges on both
+(``near_reference.py``), and extrapolated from two meshes. Soft bodies and cables of a dielectric
+are closed surfaces with the flux condition on each panel. Cloth of a dielectric has charges on both
 faces of a fine even grid; what polarises it along the sheet is by finite volumes, and across it by
-cells. A conducting cloth is one sheet of charge at its middle. ``--check`` sets thick cloth beside
-closed surfaces. The package is given what a
+cells. A conducting cloth is one sheet of charge at its middle. The package is given what a
 simulator gives: some hundred vertices of a surface, made first in its flat or unloaded form.
 """
 
@@ -79,7 +78,7 @@ def design_of(name: str, *, hard: bool = False) -> cs.Design:
 
 def material_of(row: Row) -> cs.Material | str:
     """What a body is made of."""
-    if row["kind"] == "dielectric" or row["matter"] in MATTER and row["kind"] == "dielectric":
+    if row["kind"] == "dielectric" or (row["matter"] in MATTER and row["kind"] == "dielectric"):
         return cs.Material(row["matter"], MATTER[row["matter"]])
     return "steel"
 
@@ -116,8 +115,8 @@ class Empty:
 
     def __init__(self, name: str, scale: float) -> None:
         import scipy.linalg
-        from difficult_reference import EDGE, square
         from bem_reference import Panels
+        from difficult_reference import EDGE, square
         from near_reference import Feature, Layout, sensor_panels, stops
 
         design = design_of(name, hard=True)
@@ -201,8 +200,8 @@ class Empty:
     def change(self, corners: Array, kind: str, eps: float) -> Array:
         """ΔC [F] by one body; of a dielectric the panels close it, and face out."""
         import scipy.linalg
-        from difficult_reference import filled, square
         from bem_reference import Panels
+        from difficult_reference import filled, square
         from near_integrals import potentials
         from near_reference import induced
 
@@ -306,7 +305,8 @@ def make(only: str) -> None:
         if only in row["name"]:
             known[row["name"]] = done = referenced(row)
             print(f"{row['name']:52s} {np.max(np.abs(done['delta_fF'])):9.3f} fF, adds "
-                  f"{done['error']:.2%}, {done['panels']} panels, {done['seconds']} s", flush=True)  # fmt: skip
+                  f"{done['error']:.2%}, {done['panels']} panels, {done['seconds']} s",
+                  flush=True)  # fmt: skip
         kept = [known[r["name"]] for r in rows if r["name"] in known]
         FILE.write_text("[\n" + ",\n".join(map(json.dumps, kept)) + "\n]\n", encoding="utf-8")
 
@@ -327,7 +327,9 @@ def errors(found: Array, row: Row) -> tuple[float, float]:
     return float(off.max()), float(np.abs(found[:m, :m] - truth).max() / largest)
 
 
-def measure(only: str = "", preset: str = "standard") -> Iterator[tuple[Row, float, float, float, int]]:
+def measure(
+    only: str = "", preset: str = "standard"
+) -> Iterator[tuple[Row, float, float, float, int]]:
     """Scenes, their errors, processor time of a step [s] and unknowns."""
     sims: dict[str, cs.Simulator] = {}
     for row in json.loads(FILE.read_text(encoding="utf-8")):
@@ -358,7 +360,7 @@ def main() -> None:
         return
     print(f"error of channels above {COUNTS:.0%} of the largest, of entries over it; a step")
     for row, error, other, seconds, unknowns in measure(given.only, given.preset):
-        print(f"{row['name']:52s} gap {1e3 * row['gap']:5.1f} mm {100 * error:6.1f} % {100 * other:6.1f} %"
+        print(f"{row['name']:44s} {1e3 * row['gap']:5.1f} mm {100 * error:6.1f} % {100 * other:6.1f} %"
               f"   {1e3 * seconds:5.2f} ms  {unknowns:4d}   (reference {row['error']:.1%})",
               flush=True)  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Scenes of cloth, cables and soft bodies that are bent, folded or pressed, from a seed.
 
-A cloth is bent about one axis: its profile keeps its length, as cloth does. A cable follows a curve.
-A soft body is a ball or a block that is squeezed, sheared and flattened from below.
+A cloth is bent about one axis: its profile keeps its length, as cloth does. A cable follows a
+curve. A soft body is a ball or a block that is squeezed, sheared and flattened from below.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Cloth:
         c, s = math.cos(row["yaw"]), math.sin(row["yaw"])
         out = out @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
         lowest = float(line[1].min())
-        return out + [*row["at"], row["gap"] + row["thickness"] / 2 - lowest]
+        return out + np.array([*row["at"], row["gap"] + row["thickness"] / 2 - lowest])
 
     def grid(self, n: int, m: int, off: float = 0.0) -> Array:
         """Points of a grid, (n + 1, m + 1, 3)."""
@@ -57,7 +57,7 @@ class Cloth:
         u, v = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
         size = self.row["length"], self.row["width"]
         out = np.stack([size[0] * (u - 0.5), size[1] * (v - 0.5), 0 * u], axis=-1)
-        return out.reshape(-1, 3) + [0, 0, 0.2]
+        return out.reshape(-1, 3) + np.array([0, 0, 0.2])
 
 
 def grid_faces(n: int, m: int) -> NDArray[np.int64]:
@@ -75,7 +75,7 @@ def cable_points(row: Row, n: int) -> Array:
                     row["sag"] * (2 * s) ** 2], axis=-1)  # fmt: skip
     c, t = math.cos(row["yaw"]), math.sin(row["yaw"])
     out = out @ np.array([[c, t, 0], [-t, c, 0], [0, 0, 1.0]])
-    return out + [*row["at"], row["gap"] + row["radius"]]
+    return out + np.array([*row["at"], row["gap"] + row["radius"]])
 
 
 def soft_map(row: Row) -> Callable[[Array], Array]:
@@ -91,7 +91,7 @@ def soft_map(row: Row) -> Callable[[Array], Array]:
         low, soft = -size[2] * (1 - row["pressed"]), 0.15 * size[2]
         height = low + soft * np.logaddexp(0.0, (p[..., 2] - low) / soft)
         p[..., 2] = height
-        return p + [*row["at"], row["gap"] - float(row["lowest"])]
+        return p + np.array([*row["at"], row["gap"] - float(row["lowest"])])
 
     return place
 
@@ -100,7 +100,8 @@ def ball(parts: int) -> tuple[Array, NDArray[np.int64]]:
     """A unit ball of 20 parts² triangles."""
     g = (1 + 5**0.5) / 2
     v = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g),
-                  (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)])  # fmt: skip
+                  (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1),
+                  (-g, 0, 1)])  # fmt: skip
     f = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
                   (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
                   (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])  # fmt: skip

@@ -30,7 +30,7 @@ def level(z: float, thickness: float = 1e-3, material: cs.Material | None = None
 
 
 def test_level_cloth_against_first_order_theory(simulators):
-    """Closed form: within 8 % from 4 to 60 mm; measured 4 to −6 %, of which −3 % are of the theory."""
+    """Closed form: within 8 % from 4 to 60 mm; measured −4 to 6 %."""
     sim = simulators("six_patch")
     for z in (0.004, 0.008, 0.015, 0.03, 0.06):
         found = sim.step(cs.Scene([level(z).body()])).delta
@@ -76,7 +76,7 @@ def test_jacobian_of_cloth(simulators):
 
 
 def test_cloth_before_a_conductor_adds_what_it_displaces(simulators):
-    """Closed form: between a wide plate and the electrodes cloth takes t (1 − 1/eps) off the gap."""
+    """Closed form: before a wide plate cloth takes t (1 − 1/eps) off the gap."""
     sim = simulators("six_patch")
     plate = cs.Body(cs.Box((0.2, 0.2, 0.01)), cs.Pose((0, 0, 0.017)), "steel")
     nearer = cs.Body(cs.Box((0.2, 0.2, 0.01)), cs.Pose((0, 0, 0.0165)), "steel")

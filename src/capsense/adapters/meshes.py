@@ -286,8 +286,8 @@ def tube(points: Array, radius: float, sides: int = _SIDES) -> Array:
     """Vertices of a tube along a line, of the cross-section of a round one.
 
     Rings are carried from point to point without twist (the double reflection of Wang et al.,
-    *Computation of Rotation Minimizing Frames*, ACM Transactions on Graphics 27, 2008), so that they
-    move smoothly with the points.
+    *Computation of Rotation Minimizing Frames*, ACM Transactions on Graphics 27, 2008), so that
+    they move smoothly with the points.
 
     Args:
         points: Points of the line [m], shape (n, 3), at least two.
@@ -335,7 +335,7 @@ def tube_faces(count: int, sides: int = _SIDES) -> Faces:
 
 
 def path_order(lines: NDArray[np.integer[Any]]) -> NDArray[np.int64] | None:
-    """Points of line segments (n, 2) from one end to the other; None where they are no open path."""
+    """Points of line segments (n, 2) from end to end; None where they are no open path."""
     beside: dict[int, list[int]] = {}
     for a, b in lines.tolist():
         beside.setdefault(a, []).append(b)

@@ -110,7 +110,7 @@ class BodyTemplate:
 def layer_of(
     found: tuple[RigidShape | DynamicBody, float], conducting: bool
 ) -> list[tuple[Layer, float]]:
-    """The layer of dipoles that goes with the charges of a thin sheet of triangles, if it is one."""
+    """The dipoles that go with the charges of a thin sheet of triangles, if it is one."""
     body, size = found
     if conducting or not isinstance(body, DynamicBody) or body.sheet == 0.0:
         return []

@@ -29,7 +29,7 @@ KNOWN = {
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row["name"])
 def test_against_boundary_elements(simulators, row):
-    """Reference: channels above 3 % of the largest are right to 8 %, but for those that docs name."""
+    """Reference: channels above 3 % of the largest are right to 9 %, but for those in docs."""
     sim = simulators(flexible.design_of(row["design"]))
     reading = sim.step(cs.Scene([flexible.surface_of(row).body()]))
     channels, entries = flexible.errors(reading.delta, row)

@@ -40,7 +40,8 @@ def test_bending_changes_nothing() -> None:
     """Invariant: what cloth sets against charge is the same flat and rolled up."""
     rows = [RestSurface(*strip(16, bend), THICKNESS) for bend in (0.0, 0.6)]
     flat, bent = (table_of(r) for r in rows)
-    assert flat is not None and bent is not None
+    assert flat is not None
+    assert bent is not None
     if (layout_of(rows[0]).tree.panel == layout_of(rows[1]).tree.panel).all():
         np.testing.assert_allclose(bent, flat, atol=0.01 * float(flat.max()))
     np.testing.assert_allclose(bent[1, 1], flat[1, 1], rtol=0.02)
@@ -49,7 +50,7 @@ def test_bending_changes_nothing() -> None:
 def test_charge_does_not_cross_from_sheet_to_sheet() -> None:
     """Two sheets of one surface: moving charge from one to the other costs very much."""
     v, f = strip(8)
-    two = np.concatenate([v, v + [0.3, 0.0, 0.0]])
+    two = np.concatenate([v, v + np.array([0.3, 0.0, 0.0])])
     table = table_of(RestSurface(two, np.concatenate([f, f + len(v)]), THICKNESS))
     assert table is not None
     assert table[1, 1] > 100 * np.median(np.diag(table)[1:])
@@ -70,7 +71,8 @@ def test_welded_and_separate_vertices_agree() -> None:
     one, other = (
         table_of(RestSurface(*m, THICKNESS)) for m in ((v, f), (v[f].reshape(-1, 3), faces))
     )
-    assert one is not None and other is not None
+    assert one is not None
+    assert other is not None
     np.testing.assert_allclose(other, one, rtol=1e-4, atol=1e-4 * float(one.max()))
 
 
@@ -80,4 +82,5 @@ def test_of_a_solid_it_goes_with_its_form() -> None:
     rest = RestSurface(ball.vertices, ball.faces)
     table = table_of(rest)
     assert table is not None
-    assert table[0].max() == 0.0 and table[1, 1] > 0.0
+    assert table[0].max() == 0.0
+    assert table[1, 1] > 0.0

@@ -11,10 +11,8 @@ what it takes from the field alone: :func:`fine_layers` adds that of all of them
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles
@@ -65,9 +63,7 @@ def faces_of(leaves):
             beyond[i], owner[i] = leaves.outside_fraction[j], leaves.owner[j]
             within[i], size[i] = leaves.self_interaction_weight[j], leaves.size[j]
             known[i, 0], known[i, 1] = leaves.table_rows[j, 0], leaves.table_rows[j, 1]
-    faces = ActiveClusters(
-        points, true, extent, soft, beyond, owner, within, known, size, offset
-    )
+    faces = ActiveClusters(points, true, extent, soft, beyond, owner, within, known, size, offset)
     return faces, first
 
 

@@ -236,9 +236,7 @@ def _add_matter(bodies, functions, matrix, own):
             own[f] += across
             if f < solved:
                 matrix[f, f] += across
-        elif (
-            not functions.net[f] and body.sheet > 0.0 and functions.number[f] >= body.n_tabulated
-        ):
+        elif not functions.net[f] and body.sheet > 0.0 and functions.number[f] >= body.n_tabulated:
             along = SHEET * body.inverse_susceptibility / body.sheet
             own[f] += along
             if f < solved:

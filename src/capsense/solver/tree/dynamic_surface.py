@@ -346,7 +346,9 @@ class Layer(DynamicBody):
 
     def __init__(self, sheet: DynamicBody) -> None:
         pieces = sheet.pieces
-        assert pieces is not None and pieces.normals is not None and pieces.corners is not None
+        assert pieces is not None
+        assert pieces.normals is not None
+        assert pieces.corners is not None
         self.sheet, self.pieces, self._sheet = 0.0, None, sheet
         self._panel, self._extent, self._center = sheet._panel, sheet._extent, sheet._center
         self.capacitance = sheet.capacitance

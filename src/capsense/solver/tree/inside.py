@@ -19,10 +19,10 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from capsense.scene import RestSurface, TriMesh
+from capsense.scene.surface import enclosed_volume
 from capsense.solver.bodies.blocks import free_block, impedance
 from capsense.solver.bodies.panels import SurfacePanels, panels_of
-from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.dynamic_surface import PieceLayout, layout_of, mesh_pieces
+from capsense.solver.tree.dynamic_surface import PieceLayout, layout_of
 from capsense.solver.tree.rigid import HALF_SPACE, Clusters, features
 
 Array = NDArray[np.float64]
@@ -143,10 +143,12 @@ def _laplacian(v: Array, faces: Ints) -> csr_array:
     return csr_array(out.tocsr() + coo_array((np.ones(len(lone)), (lone, lone)), out.shape).tocsr())
 
 
-def _cluster_means(layout: PieceLayout, rest: RestSurface, spread: csr_array) -> tuple[Array, Array]:
+def _cluster_means(
+    layout: PieceLayout, rest: RestSurface, spread: csr_array
+) -> tuple[Array, Array]:
     """Means over the first clusters of what pieces carry to nodes, (k, nodes), and areas (k,)."""
     tree = layout.tree
-    areas = mesh_pieces_areas(layout, rest)
+    areas = _areas(layout, rest)
     count = min(2 * min(len(areas), _FUNCTIONS) - 1, len(tree.children))
     parent = np.zeros(len(tree.children), np.int64)
     wholes = np.flatnonzero(tree.panel < 0)
@@ -167,7 +169,7 @@ def _cluster_means(layout: PieceLayout, rest: RestSurface, spread: csr_array) ->
     return np.asarray((diags_array(1.0 / area) @ member @ spread).toarray()), area
 
 
-def mesh_pieces_areas(layout: PieceLayout, rest: RestSurface) -> Array:
+def _areas(layout: PieceLayout, rest: RestSurface) -> Array:
     """Areas of the pieces of a surface in its first form, shape (n,)."""
     corners = layout.shares @ rest.vertices[rest.faces[layout.face]]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -206,23 +208,14 @@ def _carried(
     corners = layout.shares @ rest.vertices[rest.faces[layout.face]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    if (panels.normals * panels.centers).sum() * _outward(rest) < 0:
+    if enclosed_volume(rest.vertices, rest.faces) < 0.0:  # they wind the other way round
         normals = -normals
     on = cKDTree(features(panels.centers, panels.normals)).query(
         features(corners.mean(axis=1), normals)
     )[1]
-    shares = csr_array(
-        (np.ones(len(on)), (np.arange(len(on)), on)), (len(on), len(panels))
-    )
+    shares = csr_array((np.ones(len(on)), (np.arange(len(on)), on)), (len(on), len(panels)))
     means, area = _cluster_means(layout, rest, shares)
     load = _differences(layout.tree, means, area)
     out = np.asarray(load @ block @ load.T)
     out[0] = out[:, 0] = 0.0
     return np.ascontiguousarray(0.5 * (out + out.T), np.float32)
-
-
-def _outward(rest: RestSurface) -> float:
-    """Volume that the faces enclose as they wind [m³], negative where they face in."""
-    from capsense.scene.surface import enclosed_volume
-
-    return enclosed_volume(rest.vertices, rest.faces)
