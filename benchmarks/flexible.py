@@ -360,7 +360,8 @@ def main() -> None:
         return
     print(f"error of channels above {COUNTS:.0%} of the largest, of entries over it; a step")
     for row, error, other, seconds, unknowns in measure(given.only, given.preset):
-        print(f"{row['name']:44s} {1e3 * row['gap']:5.1f} mm {100 * error:6.1f} % {100 * other:6.1f} %"
+        print(f"{row['name']:44s} {1e3 * row['gap']:5.1f} mm {100 * error:6.1f} %"
+              f" {100 * other:6.1f} %"
               f"   {1e3 * seconds:5.2f} ms  {unknowns:4d}   (reference {row['error']:.1%})",
               flush=True)  # fmt: skip
 
