@@ -131,6 +131,7 @@ class ModelReader:
         if self.rules.excludes(names):
             return None
         label, kind = names[0], int(m.flex_dim[flex])
+        faces: NDArray[Any]
         if kind == 2:
             faces = _part(m.flex_elem, m.flex_elemdataadr[flex], 3 * int(m.flex_elemnum[flex]))
         elif kind == 3:
