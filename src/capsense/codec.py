@@ -177,6 +177,7 @@ def body_fields(body: Body) -> Fields:
         "dispersion": np.array(terms, dtype=float),
         "grounding": "capacitance" if tied else grounding,
         "farads": body.grounding if tied else 0.0,
+        "conductor": body.conductor or "",
     }
 
 
@@ -199,7 +200,9 @@ def read_body(message: Any, shapes: Mapping[int, Shape]) -> Body:
         grounding = message.farads if tied else message.grounding
         if not tied and grounding.startswith("ties "):
             grounding = Ties(*map(float, grounding.split()[1:]))
-        return Body(shapes[message.shape], Pose(), matter, grounding, message.name or None)
+        conductor = getattr(message, "conductor", None) or None  # older files have none
+        name = message.name or None
+        return Body(shapes[message.shape], Pose(), matter, grounding, name, conductor=conductor)
     except (SceneError, TypeError, ValueError) as error:
         raise RecordingError(f"body {message.id} is damaged: {error}") from None
 

@@ -22,7 +22,7 @@ from capsense.solver.gap.gap_kernels import (
     press_out,
 )
 from capsense.solver.gradients.gradient_kernels import jacobian
-from capsense.solver.interaction.pair_kernels import LIFTED, WALL_PENALTY, bound_images, leaf_pairs
+from capsense.solver.interaction.pair_kernels import LIFTED, bound_images, leaf_pairs
 from capsense.solver.packing import PackedBodies, View
 from capsense.solver.placement.placement_kernels import leaf_rows, placed
 from capsense.solver.selection.selection_kernels import ActiveTree, Functions, functions_of
@@ -108,12 +108,12 @@ def cut_of(
     )
 
 
-def _add_barrier(cut: ActiveTree, functions: Functions, system: System, beyond: Array) -> None:
+def _add_barrier(cut: ActiveTree, functions: Functions, system: System, barrier: Array) -> None:
     """Add the energy of charge that is out of reach; with pairs, in single precision, it would hide
     1e-3 of a matrix."""
     total, n = len(system.diagonal), functions.solved
-    on = leaf_charges(cut, functions, np.eye(total), len(beyond)).T
-    energy = (on * WALL_PENALTY * beyond**3) @ on.T
+    on = leaf_charges(cut, functions, np.eye(total), len(barrier)).T
+    energy = (on * barrier) @ on.T
     system.matrix[:] += energy[:n, :n]
     system.rest[:] += energy[n:, :n]
     system.diagonal[:] += np.diag(energy)
@@ -141,7 +141,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         leaves = placed(bodies, cut, green)
         rows = leaf_rows(leaves.points, leaves.outside_fraction, green)
         functions = functions_of(bodies, cut, leaves.outside_fraction)
-        inside = leaves._replace(outside_fraction=np.zeros_like(leaves.outside_fraction))
+        inside = leaves._replace(barrier=np.zeros_like(leaves.barrier))
         pairs = leaf_pairs(inside, green.floor)
         bound_images(leaves, rows, pairs, green)
         system = assembled(bodies, cut, functions, rows, pairs, green.phi_columns)
@@ -152,7 +152,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
             if body["neumann_to_dirichlet"] != 0:
                 own = own + body["inverse_susceptibility"] * shape.neumann_to_dirichlet[x, x]
             system.diagonal[f] = own / body["scale"]
-        _add_barrier(cut, functions, system, leaves.outside_fraction)
+        _add_barrier(cut, functions, system, leaves.barrier)
         return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:

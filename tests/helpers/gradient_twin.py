@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from surface_twin import WALL_PENALTY, off_walls
 
 from capsense.field.green_kernels import Green
 from capsense.solver.system.step import Solution
@@ -13,14 +14,15 @@ Array = np.ndarray
 STEP = 1e-5
 
 
-def jacobian(solution: Solution, origins: Array, green: Green) -> Array:
+def jacobian(solution: Solution, bodies: Array, green: Green) -> Array:
     """Central differences of the energy of frozen charges, shape (b, m, m, 6).
 
     Args:
         solution: Result of the step.
-        origins: Where the bodies turn about [m], shape (b, 3).
+        bodies: Records of the bodies, which turn about their positions, shape (b,).
         green: The Green's function.
     """
+    origins, free = bodies["position"], bodies["free"][solution.owner] != 0
     out = np.empty((len(origins), green.terminals, green.terminals, 6))
     for b, origin in enumerate(origins):
         own = solution.owner == b
@@ -38,15 +40,19 @@ def jacobian(solution: Solution, origins: Array, green: Green) -> Array:
                         .reshape(-1, 4, 3)
                         + origin
                     )
-                energies.append(_energy(points, solution, green))
+                energies.append(_energy(points, free, solution, green))
             out[b, :, :, r] = (energies[0] - energies[1]) / (2 * STEP)
     return out
 
 
-def _energy(points: Array, solution: Solution, green: Green) -> Array:
+def _energy(points: Array, free: Array, solution: Solution, green: Green) -> Array:
     """``Φᵀq + qᵀΦ - qᵀAq`` but for what does not change as rigid bodies move, shape (m, m)."""
     charge = solution.charge[:, : green.terminals]
-    rows = _rows(points, solution.points, green)
+    off = [
+        off_walls(p.mean(axis=0), green.active_bounds, f) for p, f in zip(points, free, strict=True)
+    ]
+    out, held = _smooth(np.array(off).T)
+    rows = _rows(points, solution.points, green) * (1 - out)[:, None]
     phi, psi = rows[:, : green.terminals], rows[:, green.phi_columns :]
     modes = psi.T @ charge
     image = points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * green.floor]
@@ -57,7 +63,14 @@ def _energy(points: Array, solution: Solution, green: Green) -> Array:
     other = solution.owner[:, None] != solution.owner
     far = _far(solution.points, solution.points, solution.extent)
     pairs += np.where(other, _means(points, points, far, solution.softening_length), 0.0)
+    soft = np.minimum(out**2 / np.maximum(1 - out, 1e-9), 1e4) / solution.extent
+    pairs += np.diag(WALL_PENALTY * held**3 + np.where(held < out, soft, 0.0))
     return phi.T @ charge + charge.T @ phi - charge.T @ pairs @ charge + modes.T @ modes
+
+
+def _smooth(x: Array) -> Array:
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3 - 2 * x)
 
 
 def _rows(points: Array, still: Array, green: Green) -> Array:

@@ -84,6 +84,7 @@ class Scene(tuple[tuple[Piece, RigidShape], ...]):
                 out["ground_elastance"][k] = 1e8 if piece.neutral else piece.ground_elastance.real
             elif not piece.neutral:
                 out["ground_elastance"][k] = piece.ground_elastance.real
+            out["free"][k] = piece.free
             if np.isfinite(piece.eps_r):
                 out["neumann_to_dirichlet"][k] = shape.neumann_to_dirichlet.ctypes.data
                 out["inverse_susceptibility"][k] = (1 / (piece.eps_r - 1)).real

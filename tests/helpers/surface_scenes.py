@@ -50,6 +50,7 @@ def pack(*bodies: Placed) -> Array:
         out["scale"][k], out["position"][k], out["group"][k] = 1.0, body.position, k
         out["rotation"][k] = Rotation.from_rotvec(body.turned).as_matrix()
         out["neutral"][k] = body.floating or np.isfinite(body.eps_r)
+        out["free"][k] = body.floating and not np.isfinite(body.eps_r)
         if np.isfinite(body.eps_r):
             out["neumann_to_dirichlet"][k] = shape.neumann_to_dirichlet.ctypes.data
             out["inverse_susceptibility"][k] = 1.0 / (body.eps_r - 1.0)

@@ -63,6 +63,11 @@ class Piece:
         return out
 
     @property
+    def free(self) -> bool:
+        """Whether it is a conductor that is not at ground."""
+        return not np.isfinite(self.eps_r) and (self.neutral or self.ground_elastance != 0.0)
+
+    @property
     def rotation(self) -> Array:
         return Rotation.from_rotvec(self.turned).as_matrix()
 
@@ -79,8 +84,8 @@ class Clusters(NamedTuple):
 def galerkin(pieces: tuple[Piece, ...], green: GreenFunction, room: Array) -> Array:
     """ΔC with an unknown for every panel in the room, shape (terminals, terminals) [m]."""
     found = clusters(pieces, [np.eye(len(p.panels)) for p in pieces])
-    out = beyond(found.points, room)
-    matrix = interaction(found, green, out)
+    out = beyond(found, pieces, room)[0]
+    matrix = interaction(found, pieces, green, room)
     matrix = matrix.astype(
         np.result_type(*(p.block for p in pieces), *(p.ground_elastance for p in pieces))
     )
@@ -99,18 +104,35 @@ def galerkin(pieces: tuple[Piece, ...], green: GreenFunction, room: Array) -> Ar
     return phi.T @ x[: len(phi)]
 
 
-def beyond(points: Array, room: Array) -> Array:
-    """How far clusters (k, 4, 3) are out of reach, 0 to 1, by their middles."""
-    middle = points.mean(axis=1)
-    off = np.maximum(np.maximum(room[0] - middle, middle - room[1]), 0.0)
-    return np.array([_smooth(d / WALL_FADE_LENGTH) for d in np.linalg.norm(off, axis=1)])
+def off_walls(point: Array, room: Array, free: bool) -> tuple[float, float]:
+    """How far a point is in what bodies fade out in, 0 to 1, beyond all walls and the floor."""
+    off = np.maximum(np.stack([room[0] - point, point - room[1]]), 0.0) / WALL_FADE_LENGTH
+    if free:
+        inner = room + np.array([[35e-3, 35e-3, 0.0], [-35e-3, -35e-3, -35e-3]])
+        length = np.array([[40e-3, 40e-3, 5e-3], [40e-3, 40e-3, 40e-3]])
+        off = np.maximum(np.stack([inner[0] - point, point - inner[1]]), 0.0) / length
+    return float(np.linalg.norm(off)), off[0, 2] if free else float(np.linalg.norm(off))
 
 
-def interaction(found: Clusters, green: GreenFunction, out: Array) -> Array:
-    """Mean potentials of clusters on each other but for those of a body on itself [1/m].
+def beyond(found: Clusters, pieces: tuple[Piece, ...], room: Array) -> tuple[Array, Array]:
+    """How far clusters are out of reach, 0 to 1, by their middles; and what keeps charge off
+    [1/m]."""
+    out, barrier = [], []
+    for points, owner in zip(found.points, found.owner, strict=True):
+        off, edge = off_walls(points.mean(axis=0), room, pieces[owner].free)
+        x, held = _smooth(off), _smooth(edge)
+        arms = np.linalg.norm(points[:1] - points[1:3], axis=1) / 2
+        soft = min(x * x / max(1 - x, 1e-9), 1e4) / (math.sqrt(12) * arms.max())
+        out.append(x)
+        barrier.append(WALL_PENALTY * held**3 + (soft if held < x else 0.0))
+    return np.array(out), np.array(barrier)
 
-    ``out`` is how far each is out of reach, shape (k,).
-    """
+
+def interaction(
+    found: Clusters, pieces: tuple[Piece, ...], green: GreenFunction, room: Array
+) -> Array:
+    """Mean potentials of clusters on each other but for those of a body on itself [1/m]."""
+    out, barrier = beyond(found, pieces, room)
     psi = (1 - out)[:, None] * four_point_mean(found.points, green, "psi")
     image = found.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
     other = found.owner[:, None] != found.owner
@@ -118,7 +140,7 @@ def interaction(found: Clusters, green: GreenFunction, out: Array) -> Array:
         other, inverse_distances(found.points, found.points, found.softening_length), 0.0
     )
     images = inverse_distances(found.points, image, found.softening_length) + psi @ psi.T
-    return between - images + np.diag(WALL_PENALTY * out**3)
+    return between - images + np.diag(barrier)
 
 
 def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
@@ -268,7 +290,7 @@ def reduced(
     what panels are too coarse for."""
     share = [shares(*tree) for tree in trees]
     found = clusters(pieces, [s[:, c.active] for s, c in zip(share, chosen, strict=True)])
-    out = beyond(found.points, room)
+    out = beyond(found, pieces, room)[0]
     columns, blocks, fade, above, ends = [], [], [], [], []
     for b, (piece, tree, all_of, cut) in enumerate(zip(pieces, trees, share, chosen, strict=True)):
         children, own = tree[0], found.owner == b
@@ -296,7 +318,7 @@ def reduced(
         ]
         ends.append(np.concatenate([[0.0] * net, np.where(members_out, 0.0, panels)]))
     to_leaves = np.concatenate(columns, axis=1)
-    matrix = to_leaves.T @ interaction(found, green, out) @ to_leaves
+    matrix = to_leaves.T @ interaction(found, pieces, green, room) @ to_leaves
     at = np.cumsum([0, *(len(b) for b in blocks)])
     for b, block in enumerate(blocks):
         matrix[at[b] : at[b + 1], at[b] : at[b + 1]] += block
@@ -458,11 +480,11 @@ def _means(
         size = piece.scale * np.sqrt(12.0 * max(np.linalg.eigvalsh(second)[2], 0.0))
         near = 1 / np.maximum(np.linalg.norm(point - sources, axis=1), LEAST)
         inside = min((point - room[0]).min(), (room[1] - point).min())
-        off = np.linalg.norm(np.maximum(np.maximum(room[0] - point, point - room[1]), 0.0))
+        off, _ = off_walls(point, room, piece.free)
         close = _smooth((CLOSE[1] - green.distance(point[None])[0]) / (CLOSE[1] - CLOSE[0]))
         out[k] = (1 - close) * tabulated(packed.grid, point)[: green.far_phi.shape[1]]
         out[k] += close * (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
-        within = 1 - _smooth(off / WALL_FADE_LENGTH)
+        within = 1 - _smooth(off)
         out[k] *= within
         crossing = _smooth(2 - 4 * abs(inside) / size)
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))

@@ -99,7 +99,7 @@ class GenesisSensors(ParallelSensors):
                         ]  # fmt: skip
                     else:
                         each = Ground(shape, rules.material_of((link.name,)), tie.grounding)
-                    parts.append(WorldShape((link.name,), link.idx, tree, tie.owner, each))
+                    parts.append(WorldShape((link.name,), link.idx, tree, tie, each))
                     poses.append((*own.position, *own.quaternion))
         carriers = [("world", -1) if s.link is None else (s.link.name, s.link.idx) for s in sites]
         super().__init__(parts, carriers, worlds, design, rules, device, other)

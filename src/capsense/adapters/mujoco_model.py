@@ -115,6 +115,7 @@ class ModelReader:
             pose=Pose(self.model.geom_pos[geom].tolist(), (x, y, z, w)),
             material=material,
             tie=tie,
+            tree=self._tree(int(self.model.geom_bodyid[geom])),
         )
 
     def soft_solid(self, flex: int, data: mujoco.MjData) -> SoftSolid | None:
@@ -157,7 +158,12 @@ class ModelReader:
             material=material,
             tie=tie,
             thickness=max(2 * float(m.flex_radius[flex]), _THINNEST),
+            tree=self._tree(int(m.flex_vertbodyid[first])),
         )
+
+    def _tree(self, body: int) -> int:
+        """Number of what hangs together with a body by joints; -1 for the world itself."""
+        return int(self.model.body_rootid[body]) or -1
 
     def _matter(self, names: Names) -> tuple[Material, Tie]:
         """What something is made of, and its tie to ground."""

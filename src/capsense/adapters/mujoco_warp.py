@@ -96,9 +96,8 @@ class CapacitiveSensors(ParallelSensors):
                 body = Ground(solid.shape, solid.material, solid.tie.grounding)
             geoms.append(geom)
             own = int(model.geom_bodyid[geom])
-            root = int(model.body_rootid[own])
-            link, tree = (number if number > 0 else -1 for number in (own, root))
-            parts.append(WorldShape((solid.label,), link, tree, solid.tie.owner, body))
+            link = own if own > 0 else -1
+            parts.append(WorldShape((solid.label,), link, solid.tree, solid.tie, body))
         numbers = find_sites(model, [sites] if isinstance(sites, str) else sites)
         carriers = [(model.site(k).name, int(model.site_bodyid[k])) for k in numbers]
         device = data.geom_xpos.device

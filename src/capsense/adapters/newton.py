@@ -84,8 +84,7 @@ class SensorCapacitance(ParallelSensors):
                 bodies = [reader.body(k, labels[column]) for k in table[:, column].tolist()]
             link, label = int(carrier[table[0, column]]), labels[column]
             tree = int(trees[link]) if link >= 0 else -1
-            owner = rules.tie_of((label,)).owner
-            parts.append(WorldShape((label,), link, tree, owner, bodies))
+            parts.append(WorldShape((label,), link, tree, rules.tie_of((label,)), bodies))
             columns.append(column)
         warn_left_out(left, "a fleet sees no cones and Gaussians")
         known = np.flatnonzero(site)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +18,9 @@ from capsense._validate import chosen_rows
 from capsense.adapters.grounds import Ground, TerrainParts
 from capsense.adapters.meshes import Terrain
 from capsense.adapters.record import ParallelData, Record
-from capsense.adapters.rules import AttachOptions, Names, Rules, matches
+from capsense.adapters.rules import AttachOptions, Names, Rules, Tie, matches
 from capsense.design import load_design
-from capsense.design.model import Design
+from capsense.design.model import Design, Domain
 from capsense.errors import SceneError, listed
 from capsense.fleet import Fleet
 from capsense.fleet.bodies import on_device
@@ -29,7 +29,6 @@ from capsense.readout import Readout
 from capsense.readout.randomisation import ReadoutRandomisation
 from capsense.scene import Body, Shape
 from capsense.simulator import PresetName
-from capsense.solver.tree.matter import matter_of
 
 Fixed = tuple[NDArray[np.integer], NDArray[np.floating]]
 """Numbers of bodies, -1 for the world itself, and poses on them (x, y, z [m]; quaternion x, y, z,
@@ -66,8 +65,8 @@ class WorldShape:
     """The simulator's body that carries it, in the first world; -1 for the world itself."""
     tree: int
     """What hangs together by joints has the same number; -1 for what is fixed to the world."""
-    owner: str
-    """The rule that says what ties it to ground, see :class:`~capsense.adapters.rules.Tie`."""
+    tie: Tie
+    """What ties it to ground."""
     bodies: Body | Sequence[Body | None] | Ground
     """What it is: one for all worlds, or one for each, None where there is none."""
 
@@ -76,12 +75,22 @@ class WorldShape:
         """The matter that goes on below a face, if it is that."""
         return self.bodies if isinstance(self.bodies, Ground) else None
 
+    def seen(self, domain: Domain) -> WorldShape:
+        """The same with a plate for matter that goes on, and with the conductor of each body."""
+        ground, conductor = self.ground, self.tie.conductor(self.tree)
+        bodies: Any = self.bodies if ground is None else ground.body(domain)
+        if conductor is not None:
+            some = [bodies] if isinstance(bodies, Body) else bodies
+            made = {id(b): b and replace(b, conductor=conductor) for b in some}
+            bodies = made[id(bodies)] if isinstance(bodies, Body) else [made[id(b)] for b in some]
+        return replace(self, bodies=bodies)
+
 
 class ParallelSensors:
     """Sensors of one design on several sites of a robot, in all worlds of a simulator.
 
-    Conductors that hang together by joints and float, or have a capacitance to ground, by one rule
-    are one conductor, whether they touch or not. A capacitance is shared out among all of its rule.
+    All that a rule gives a capacitance to ground is one conductor, and so is what hangs together by
+    joints and floats by one rule, see :meth:`Tie.conductor`.
 
     A plane is a half space: the part near each sensor is seen, as a plate. Of a terrain that is
     wider than 0.8 m each sensor has a part of its own, which is looked up at every reading from
@@ -119,10 +128,7 @@ class ParallelSensors:
         length = _whole("history_length", options.get("history_length", 0))
         grounds = [parts[k].ground for k in kept]
         domain = self.design.domain
-        seen = [
-            parts[k] if ground is None else replace(parts[k], bodies=ground.body(domain))
-            for k, ground in zip(kept, grounds, strict=True)
-        ]
+        seen = [parts[k].seen(domain) for k in kept]
         first = [_some_body(part) for part in seen]
         count = len(sites)
         places = self._places = _numbered(grounds, count)
@@ -142,15 +148,12 @@ class ParallelSensors:
         """Names of the shapes that are seen, and of the sites, in order."""
         self.carriers = self.sites
         """What carries each sensor, by name."""
-        shared, groups = _connected(seen, self.fleet.excitation_frequency)
-        for part, bodies in enumerate(shared):
+        for part, whole in enumerate(seen):
             for place in places[part]:
                 if _is_terrain(grounds[part]):
                     self.fleet.change(place, None)
-                elif bodies is not first[part]:
-                    self.fleet.change(place, bodies)
-        for group in groups:
-            self.fleet.join([place for part in group for place in places[part]])
+                elif not isinstance(whole.bodies, Body | Ground):
+                    self.fleet.change(place, whole.bodies)
         for sensor, (_, own) in enumerate(sites):
             hidden = [
                 place
@@ -160,7 +163,7 @@ class ParallelSensors:
                 or (_is_terrain(grounds[part]) and k != sensor)
             ]
             self.fleet.hide(sensor, hidden)
-        self._matter = [_some_body(replace(seen[k], bodies=shared[k])) for k in range(len(seen))]
+        self._matter = first
         self.terrains = [
             TerrainParts(ground.shape, self._matter[part], places[part], worlds, domain)
             for part, ground in enumerate(grounds)
@@ -477,40 +480,6 @@ def _numbered(grounds: Sequence[Ground | None], sensors: int) -> list[list[int]]
 def _host(values: Any) -> Any:
     """An array on a device as one of NumPy."""
     return values.numpy() if isinstance(values, wp.array) else values.numpy(force=True)
-
-
-def _connected(
-    parts: Sequence[WorldShape], frequency: float
-) -> tuple[list[Body | Sequence[Body | None]], list[list[int]]]:
-    """The bodies of parts with their shares of capacitances, and which parts are one conductor."""
-    free = [k for k, part in enumerate(parts) if _is_free(_some_body(part), frequency)]
-    count = Counter(parts[k].owner for k in free)
-    out: list[Any] = [part.bodies for part in parts]
-    groups: dict[tuple[int, str], list[int]] = defaultdict(list)
-    for k in free:
-        tree, owner = parts[k].tree, parts[k].owner
-        out[k] = _with_share(out[k], count[owner])
-        if tree >= 0:
-            groups[tree, owner].append(k)
-    return out, [group for group in groups.values() if len(group) > 1]
-
-
-def _is_free(body: Body, frequency: float) -> bool:
-    """Whether a body is a conductor that is not simply grounded."""
-    return body.grounding != "grounded" and bool(matter_of([body], frequency).conducting[0])
-
-
-def _with_share(bodies: Body | Sequence[Body | None], count: int) -> Body | Sequence[Body | None]:
-    """Bodies with one of ``count`` equal shares of their capacitance to ground."""
-    some = [bodies] if isinstance(bodies, Body) else bodies
-    made = {
-        id(b): Body(b.shape, b.pose, b.material, b.grounding / count, b.name, b.force)
-        for b in some
-        if b is not None and not isinstance(b.grounding, str)
-    }
-    if isinstance(bodies, Body):
-        return made.get(id(bodies), bodies)
-    return [made.get(id(b), b) for b in bodies]
 
 
 def _some_body(part: WorldShape) -> Body:

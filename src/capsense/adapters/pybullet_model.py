@@ -211,6 +211,7 @@ class ClientSource(WorldSource):
                 pose=pose,
                 material=material,
                 tie=tie,
+                tree=link.body,
             )
 
     def _soft_of(self, index: int) -> list[SoftSolid]:
@@ -224,7 +225,7 @@ class ClientSource(WorldSource):
             return []
         mesh = SoftMesh(self.client, link)
         material, tie = matter_of(self.client, link, self.rules)
-        return [SoftSolid(link.names[-1], mesh.faces, mesh.vertices, material, tie)]
+        return [SoftSolid(link.names[-1], mesh.faces, mesh.vertices, material, tie, tree=link.body)]
 
     def _shapes_of(self, link: Link) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
         """Shapes, and their poses in the frame of the link's centre of mass."""

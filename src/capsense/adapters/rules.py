@@ -26,7 +26,23 @@ class Tie:
     grounding: Grounding
     """``"grounded"``, ``"floating"`` or a capacitance [F]."""
     owner: str
-    """The rule that says so. All solids of one rule share a capacitance: they are one body."""
+    """The rule that says so."""
+
+    def conductor(self, tree: int) -> str | None:
+        """The conductor that a solid belongs to, as a body names it; None for one of its own.
+
+        All solids of a rule that gives a capacitance are one conductor. Of a rule that lets them
+        float, those are that hang together by joints.
+
+        Args:
+            tree: What hangs together by joints has the same number; -1 for what is fixed to the
+                world.
+        """
+        if isinstance(self.grounding, float):
+            return self.owner
+        if self.grounding in ("grounded", "local") or tree < 0:
+            return None
+        return f"{self.owner}, tree {tree}"
 
 
 def matches(pattern: str, names: Names) -> bool:

@@ -57,6 +57,8 @@ class Solid:
     material: Material
     tie: Tie
     """What ties it to ground."""
+    tree: int = -1
+    """What hangs together by joints has the same number; -1 for what is fixed to the world."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +76,8 @@ class SoftSolid:
     """What ties it to ground."""
     thickness: float = SHEET_THICKNESS
     """That of a sheet [m]."""
+    tree: int = -1
+    """As of :class:`Solid`."""
 
 
 class Frames(NamedTuple):
@@ -145,17 +149,11 @@ class World:
             shape = solid.shape if isinstance(solid.shape, Shape) else plate
             count = taken[solid.label] = taken.get(solid.label, 0) + 1
             label = solid.label if count == 1 else f"{solid.label}#{count}"
-            self._bodies.append(Body(shape, Pose(), solid.material, solid.tie.grounding, label))
-        owners = list(dict.fromkeys(s.tie.owner for s in self.solids))
-        self._sharing = np.array(
-            [
-                -1 if isinstance(s.tie.grounding, str) else owners.index(s.tie.owner)
-                for s in self.solids
-            ],
-            dtype=np.int64,
-        )
+            conductor = solid.tie.conductor(solid.tree)
+            self._bodies.append(
+                Body(shape, Pose(), solid.material, solid.tie.grounding, label, conductor=conductor)
+            )
         self._surfaces: list[DeformableSurface | None] = [None] * len(self.soft)
-        self._tied: dict[tuple[int, int], Body] = {}
         self._layout = Layout(
             np.array([s.frame for s in self.solids], dtype=np.int64),
             np.array([s.pose.position for s in self.solids]).reshape(n, 3),
@@ -187,12 +185,7 @@ class World:
             bad = ~np.isfinite(placed.position.sum(axis=1) + placed.quaternion.sum(axis=1))
             raise _diverged(repr(self.solids[int(np.flatnonzero(bad)[0])].label))
         seen = np.flatnonzero(placed.seen)
-        sharing = self._sharing[seen]
         bodies = [self._bodies[i] for i in seen.tolist()]
-        if sharing.max(initial=-1) >= 0:
-            count = np.bincount(sharing + 1)[sharing + 1]
-            for k in np.flatnonzero(sharing >= 0).tolist():
-                bodies[k] = self._share(int(seen[k]), int(count[k]))
         poses = zip(placed.position[seen].tolist(), placed.quaternion[seen].tolist(), strict=True)
         parts = [
             self._near(i, b.moved(Pose(*p)))
@@ -243,20 +236,10 @@ class World:
                     )  # fmt: skip
                 else:
                     surface.vertices = vertices
-                out.append(surface.body())
+                out.append(replace(surface.body(), conductor=soft.tie.conductor(soft.tree)))
             except SceneError as error:
                 raise SceneError(f"{soft.label!r}: {error}") from None
         return out
-
-    def _share(self, index: int, count: int) -> Body:
-        """A body that has one of ``count`` equal shares of its capacitance to ground."""
-        key = index, count
-        if key not in self._tied:
-            b = self._bodies[index]
-            assert not isinstance(b.grounding, str)
-            grounding = b.grounding / count
-            self._tied[key] = Body(b.shape, b.pose, b.material, grounding, b.name, b.force)
-        return self._tied[key]
 
 
 def _diverged(what: str) -> SceneError:

@@ -8,14 +8,22 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from capsense._by_reference import by_reference
 from capsense._jit import kernel
 
-WALL_FADE_LENGTH = 0.01
-"""Bodies fade out over this distance beyond the room, and behind the face of a flat design, over
-the domain's shortest side."""
+WALL_EDGE = 0.01
+"""Bodies are out of the room so far beyond its bounds, over the domain's shortest side."""
+WALL_FADE_LENGTH = WALL_EDGE, 0.08
+"""They fade out over this distance up to there, over that side; the second of conductors that are
+not at ground, whose potential the walls would else hold as they come in. Next to the design, and
+behind its face, all fade over the first."""
+WALL_PENALTY = 1e5
+"""Energy of charge that is out of reach [1/m]."""
+FADED = 1e4
+"""Energy that keeps charge off conductors that fade out, over that of a leaf by itself, at most."""
 DEEP, STEEP = (2.3, 3.8), 4.0
 """What is deeper behind the face of a flat design than the first of these, over the validity
 distance, comes to be screened by it, over the second; depth from the sides counts so many times."""
@@ -35,6 +43,11 @@ class Space(NamedTuple):
     """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
     extent: float
     """Shortest side of the domain [m]."""
+    inner: NDArray[Any]
+    """Corners of the box in which bodies are whole [m], of conductors that are not at ground the
+    second, shape (2, 2, 3)."""
+    fade: NDArray[Any]
+    """Over how much they fade out beyond each of its sides [m], shape (2, 2, 3)."""
     validity: float
     """Distance from the face down to which the Green's function is valid [m]."""
     limit: float
@@ -66,18 +79,57 @@ def smooth(x):
     return x * x * (3.0 - 2.0 * x)
 
 
+def fading(room, box, extent):
+    """Corners of the box in which bodies are whole, and over how much they fade out beyond it [m].
+
+    Args:
+        room: Corners of the part of the domain where bodies count [m], shape (2, 3).
+        box: Corners of the design [m], shape (2, 3).
+        extent: Shortest side of the domain [m].
+
+    Returns:
+        As :attr:`Space.inner` and :attr:`Space.fade`.
+    """
+    inwards, length = np.array([[1.0], [-1.0]]), extent * np.reshape(WALL_FADE_LENGTH, (2, 1, 1))
+    inner = room + inwards * (length - length[0])
+    close = inwards * (box - inner) < length
+    return np.where(close, room, inner), np.where(close, length[0], length)
+
+
 @kernel
-def outside_fraction(points, space, middle):
+def off_walls(x, y, z, free, space):
+    """How far a point is in what bodies fade out in, from 0 where they are whole to 1 [-].
+
+    ``free`` is 1 of conductors that are not at ground, else 0.
+
+    Returns:
+        That; and the same at sides where all bodies fade out over one distance.
+    """
+    square = edge = 0.0
+    for i in range(3):
+        c = x if i == 0 else (y if i == 1 else z)
+        low = (space.inner[free, 0, i] - c) / space.fade[free, 0, i]
+        high = (c - space.inner[free, 1, i]) / space.fade[free, 1, i]
+        off = max(low, high, 0.0) ** 2
+        square += off
+        side = 0 if low > high else 1
+        edge += off if space.fade[free, side, i] == space.fade[0, side, i] else 0.0
+    return math.sqrt(square), math.sqrt(edge)
+
+
+@kernel
+def out_of_reach(points, free, space, middle):
     """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face.
 
-    ``middle`` is workspace for a point, shape (3,).
+    ``free`` is as of :func:`off_walls`; ``middle`` is workspace for a point, shape (3,).
+
+    Returns:
+        By all; and by the face, and sides where all bodies fade out over one distance.
     """
-    out, depth = 0.0, math.inf
+    depth = math.inf
     for i in range(3):
-        c = 0.5 * (points[0, i] + points[3, i])
-        off = max(space.active_bounds[0, i] - c, c - space.active_bounds[1, i], 0.0)
-        out += off * off
-        middle[i] = c
+        middle[i] = 0.5 * (points[0, i] + points[3, i])
+    out, edge = off_walls(middle[0], middle[1], middle[2], free, space)
     _put(middle, on_face(middle[0], middle[1], middle[2], space.curvature))
     for i in range(3):
         c = middle[i]
@@ -86,7 +138,28 @@ def outside_fraction(points, space, middle):
         else:
             depth = min(depth, space.face[1, 2] - space.limit - c)
     deep = (depth / space.validity - DEEP[0]) / DEEP[1] if space.has_face else 0.0
-    return smooth(max(math.sqrt(out) / (WALL_FADE_LENGTH * space.extent), deep))
+    return smooth(max(out, deep)), smooth(max(edge, deep))
+
+
+@kernel
+def barrier(x, held, extent):
+    """Energy that keeps charge off a leaf that is out of reach [1/m].
+
+    Args:
+        x, held: What :func:`out_of_reach` returns.
+        extent: Extent of the leaf [m].
+    """
+    soft = min(x * x / max(1.0 - x, 1e-9), FADED) / extent if held < x else 0.0
+    return WALL_PENALTY * held**3 + soft
+
+
+@kernel
+def barrier_slope(x, held, extent):
+    """Derivative of :func:`barrier` by x, and by ``held`` where these are the same."""
+    if held < x:
+        y = 1.0 - x
+        return x * (2.0 - x) / (y * y * extent) if x * x < FADED * y else 0.0
+    return 3.0 * WALL_PENALTY * x * x
 
 
 @kernel

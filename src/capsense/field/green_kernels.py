@@ -30,7 +30,7 @@ from capsense._simd import (
 )
 from capsense.design.model import Design
 from capsense.field.face import cover_of, face_box
-from capsense.field.face_kernels import Space, smooth
+from capsense.field.face_kernels import Space, fading, smooth
 from capsense.field.gap_table import GapTable
 from capsense.field.green import LEVELS, GreenFunction
 from capsense.field.grid_kernels import Grid, grid_over
@@ -221,7 +221,10 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         return np.clip(out[:, : len(points)].T, 0.0, 1.0)
 
     gap, has_face = pack_gap(green.gap, green.clearance, design), math.isfinite(cover_of(design))
-    space = Space(has_face, gap.face, gap.curvature, room, extent, gap.validity, gap.soft.limit)
+    space = Space(
+        has_face, gap.face, gap.curvature, room, extent,
+        *fading(room, np.asarray(green.box, float), extent), gap.validity, gap.soft.limit,
+    )  # fmt: skip
     return Green(
         (near, middle, far),
         score_table,

@@ -108,6 +108,9 @@ class BodyTable:
         )  # fmt: skip
         self.given = np.full(shape, None, object)
         """The bodies themselves, shape (e, b)."""
+        self._conductors: list[str | None] = [None] * places
+        self._ties = np.zeros(shape, complex), np.ones(shape, np.int64)
+        """Tie and neutrality of each body by itself, shapes (e, b)."""
         self.forces: Array = np.full(shape, np.nan)
         """Normal forces that press them onto a cover [N], NaN for none, shape (e, b)."""
 
@@ -153,6 +156,13 @@ class BodyTable:
         if len(each) != len(rows):
             raise SceneError(f"{len(each)} bodies are given for {len(rows)} environments")
         alike = {id(body): body for body in each}
+        for one in alike.values():
+            name, own = self._conductor(one), self._conductors[place]
+            if one is not None and name != own:
+                raise SceneError(
+                    f"place {place} belongs to conductor {own!r}, and a body of conductor {name!r} "
+                    "is given; conductors of places stay as the fleet was made with"
+                )
         known = {key: self._row(body) for key, body in alike.items()}
         table = self.bodies
         values = [known[id(body)] for body in each]
@@ -160,10 +170,41 @@ class BodyTable:
             _require_conductors(each, self._solver.excitation_frequency)
         for column, part in zip(table[2:-2], zip(*values, strict=True), strict=True):
             column[rows, place] = part
+        for kept, column in zip(self._ties, (table.ground_elastance, table.neutral), strict=True):
+            kept[rows, place] = column[rows, place]
+        self._tie_once(rows, place)
         self.given[rows, place] = each
         self.forces[rows, place] = [
             np.nan if body is None or body.force is None else body.force for body in each
         ]
+
+    def conduct(self, bodies: Sequence[Body | None]) -> None:
+        """Make the places of bodies (b,) that name one conductor one."""
+        self._conductors = [self._conductor(body) for body in bodies]
+        for name in dict.fromkeys(self._conductors):
+            known = [place for place, other in enumerate(self._conductors) if other == name]
+            if name is not None and len(known) > 1:
+                self.join(known)
+
+    def _conductor(self, body: Body | None) -> str | None:
+        """The conductor that a body names, if it conducts."""
+        if body is None or body.conductor is None:
+            return None
+        conducts = matter_of([body], self._solver.excitation_frequency).conducting[0]
+        return body.conductor if conducts else None
+
+    def _tie_once(self, rows: NDArray[np.int64], place: int) -> None:
+        """Give the tie of a place's conductor to the first of its bodies in each environment."""
+        name, table = self._conductors[place], self.bodies
+        if name is None:
+            return
+        known = [p for p, other in enumerate(self._conductors) if other == name]
+        at = np.ix_(rows, np.array(known))
+        there = table.choice[at] >= 0
+        first = there & (np.cumsum(there, axis=1) == 1)
+        tie, neutral = self._ties
+        table.ground_elastance[at] = np.where(first, tie[at], 0.0)
+        table.neutral[at] = np.where(first, neutral[at], 1)
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """See :meth:`Fleet.hide`."""

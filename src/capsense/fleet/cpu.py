@@ -15,7 +15,7 @@ from capsense._thread_pool import in_parts
 from capsense.constants import UNIT
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
-from capsense.field.face_kernels import WALL_FADE_LENGTH
+from capsense.field.face_kernels import WALL_EDGE
 from capsense.field.green_kernels import Green
 from capsense.fleet.bodies import Bodies, BodyTable
 from capsense.reading import FleetReading, FleetTouch
@@ -95,7 +95,7 @@ def _step_rows(
                 poses,
                 e,
                 s,
-                (green.active_bounds, WALL_FADE_LENGTH * green.extent),
+                (green.active_bounds, WALL_EDGE * green.extent),
                 room,
                 place,
             )
@@ -159,6 +159,10 @@ def _seen(
                 count += 1
     for c in range(count):
         _connect(bodies, e, records[:count], place, c)
+    for c in range(count):
+        conducts = records[c].inverse_susceptibility == 0.0
+        tied = records[c].neutral != 0 or records[c].ground_elastance > 0.0
+        records[c].free = 1 if conducts and tied else 0
     return count
 
 
@@ -353,7 +357,7 @@ class CpuCore:
         solver, table = self._solver, self._table.bodies
         where = _in_units(solver, bodies, sensors, self._table.forces)
         green = solver.green
-        sight = green.active_bounds, WALL_FADE_LENGTH * green.extent
+        sight = green.active_bounds, WALL_EDGE * green.extent
         records = np.empty(table.choice.shape[1], BODY)
         place = np.empty(len(records), np.int64)
         out = np.zeros((len(rows), sensors.shape[1]), np.bool_)
@@ -388,7 +392,7 @@ class CpuCore:
                 where,
                 e,
                 s,
-                (solver.green.active_bounds, WALL_FADE_LENGTH * solver.green.extent),
+                (solver.green.active_bounds, WALL_EDGE * solver.green.extent),
                 records,
                 place,
             )

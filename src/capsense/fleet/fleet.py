@@ -142,6 +142,7 @@ class Fleet:
         self._one, self._warned = ForkSafeRLock(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table, self.electrode_names)
         self._warp = None if device == "cpu" else self._on_warp(budget)
+        self.table.conduct(bodies)
         for place, body in enumerate(bodies):
             self.change(place, body)
 
@@ -581,8 +582,12 @@ class Fleet:
         """Some environments as a fleet on the CPU, whose places are joined alike."""
         given, known = self.table.given[rows], self.table.bodies
         some: Body = next(body for body in self.table.given.ravel() if body is not None)
+        first = [
+            next((body for body in column if body is not None), replace(some, conductor=None))
+            for column in self.table.given.T
+        ]
         finer = Fleet(
-            self.design, [some] * self.places, len(rows), sensors=self.sensors, preset=preset,
+            self.design, first, len(rows), sensors=self.sensors, preset=preset,
             excitation_frequency=self.excitation_frequency,
         )  # fmt: skip
         for place in range(self.places):

@@ -22,7 +22,15 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.fleet.warp_cut import SOURCES, Places, Response, Shapes, WarpActiveTree, idle, many
+from capsense.fleet.warp_cut import (
+    SOURCES,
+    Places,
+    Response,
+    Shapes,
+    WarpActiveTree,
+    idle,
+    many,
+)
 from capsense.fleet.warp_pairs import (
     COLUMNS,
     Leaf,
@@ -37,13 +45,12 @@ from capsense.fleet.warp_pairs import (
     some,
 )  # fmt: skip
 from capsense.fleet.warp_solve import Left, own, times
-from capsense.solver.interaction.pair_kernels import WALL_PENALTY
 from capsense.solver.system.system_kernels import COARSE, GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 _SOURCES, _COLUMNS = wp.constant(SOURCES), wp.constant(COLUMNS)
-_WALL_PENALTY, _COARSE, _GAIN = (wp.constant(x) for x in (WALL_PENALTY, COARSE, GAIN))
+_COARSE, _GAIN = wp.constant(COARSE), wp.constant(GAIN)
 
 
 @wp.kernel
@@ -219,14 +226,10 @@ def residuals(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTr
     leaf = leaf_of(cut, part, v)
     out = _met(green, cut, leaf, b, first, v, left)
     whole = own(shapes, places, e, b, x, x)
-    whole[0] += (
-        _WALL_PENALTY * leaf.outside_fraction * leaf.outside_fraction * leaf.outside_fraction
-    )
+    whole[0] += leaf.barrier
     leaf = leaf_of(cut, part + 1, v)
     out -= _met(green, cut, leaf, b, first, v, left)
-    whole[0] += (
-        _WALL_PENALTY * leaf.outside_fraction * leaf.outside_fraction * leaf.outside_fraction
-    )
+    whole[0] += leaf.barrier
     o = b * cut.clusters
     other = wp.where(imaginary, first - green.phi_columns, first + green.phi_columns)
     for j in range(cut.clusters):

@@ -76,11 +76,9 @@ class WarpCore:
             warp_cut.WarpActiveTree,
             {
                 "split number score part mix weight panel_end_fraction out": (n, views),
-                "node lifted extent softening_length outside_fraction near points unlifted": (
-                    3 * n,
-                    views,
-                ),
-                "pose moved leader ground_elastance slot": (places, views),
+                "node lifted extent softening_length barrier": (3 * n, views),
+                "outside_fraction near points unlifted": (3 * n, views),
+                "pose moved leader ground_elastance slot free": (places, views),
                 "lossy width walled columns": (views,),
             },
         )

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.field.face_kernels import DEEP, STEEP, WALL_FADE_LENGTH
-from capsense.solver.interaction.pair_kernels import LIFTED, WALL_PENALTY
+from capsense.field.face_kernels import DEEP, FADED, STEEP, WALL_EDGE, WALL_PENALTY
+from capsense.solver.interaction.pair_kernels import LIFTED
 from capsense.solver.selection.evaluation_kernels import LONG
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -35,9 +35,9 @@ _CROSSING, _CROSSED = wp.constant(2.0), wp.constant(4.0)
 _MANY = wp.constant(12)
 """Bodies of more panels for each cluster are wide ones, see ``BodyTable.share``."""
 _LONG0, _LONG1 = (wp.constant(x) for x in LONG)
-_LIFTED, _WALL_PENALTY = wp.constant(LIFTED), wp.constant(WALL_PENALTY)
+_LIFTED, _WALL_PENALTY, _FADED = (wp.constant(x) for x in (LIFTED, WALL_PENALTY, FADED))
 _DEEP, _BEHIND = wp.constant(DEEP[0]), wp.constant(DEEP[1])
-_STEEP, _WALL_FADE_LENGTH = wp.constant(STEEP), wp.constant(WALL_FADE_LENGTH)
+_STEEP, _WALL_EDGE = wp.constant(STEEP), wp.constant(WALL_EDGE)
 
 
 @wp.struct
@@ -96,6 +96,7 @@ class Response:
     box1: wp.vec3
     room0: wp.vec3
     room1: wp.vec3
+    walls: wp.array3d(dtype=wp.vec3)  # ``Space.inner`` and ``Space.fade``, (2, 2, 2)
     middle: wp.vec3
     length: wp.float32  # of what kernels take for a length of one [m]; poses are in metres
 
@@ -116,6 +117,8 @@ class WarpActiveTree:
     part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
     mix: wp.array2d(dtype=wp.float32)  # the same in the functions solved for, see weigh, (n, v)
     weight: wp.array2d(dtype=wp.float32)
+    barrier: wp.array2d(dtype=wp.float32)  # energy that keeps charge off [1/m], (l, v)
+    free: wp.array2d(dtype=wp.int32)  # whether a body is a conductor that is not at ground, (b, v)
     walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
     panel_end_fraction: wp.array2d(
@@ -241,7 +244,7 @@ def stand(
     away = off_box(wp.transform_get_translation(at), green.room0, green.room1)
     if (
         wp.max(away[0], wp.max(away[1], away[2]))
-        > scale * shapes.radius[u] + _WALL_FADE_LENGTH * green.extent
+        > scale * shapes.radius[u] + _WALL_EDGE * green.extent
     ):
         return
     cut.node[o, v] = shapes.first[u]
@@ -350,6 +353,34 @@ def lift_back(force: wp.vec3, p: wp.vec3, gap: float, green: Response):
     return out + (way / (2.0 * gap) - held_off(way, gap) / way) * along * u
 
 
+@wp.func
+def off_walls(c: wp.vec3, free: int, green: Response):
+    """How far a point is in what bodies fade out in, along each axis: minus before lower walls."""
+    low = wp.cw_div(wp.max(green.walls[0, free, 0] - c, wp.vec3()), green.walls[1, free, 0])
+    high = wp.cw_div(wp.max(c - green.walls[0, free, 1], wp.vec3()), green.walls[1, free, 1])
+    return high - low
+
+
+@wp.func
+def at_edges(off: wp.vec3, free: int, green: Response):
+    """What :func:`off_walls` returns at sides where all bodies fade out over one distance."""
+    out = off
+    for i in range(3):
+        side = wp.where(off[i] < 0.0, 0, 1)
+        if green.walls[1, free, side][i] != green.walls[1, 0, side][i]:
+            out[i] = 0.0
+    return out
+
+
+@wp.func
+def barrier(x: float, held: float, extent: float):
+    """Energy that keeps charge off a leaf that is out of reach, as ``face_kernels.barrier``."""
+    soft = float(0.0)
+    if held < x:
+        soft = wp.min(x * x / wp.max(1.0 - x, 1.0e-9), _FADED) / extent
+    return _WALL_PENALTY * held * held * held + soft
+
+
 @wp.kernel
 def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     """Place all leaves in the sensor frame, and find where they stand to design and walls."""
@@ -377,7 +408,8 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
         points[q] = wp.transform_point(cut.pose[b, v], scale * shapes.points[k, q])
     cut.unlifted[i, v] = points
     c = 0.5 * (points[0] + points[3])
-    off = wp.length(off_box(c, green.room0, green.room1))
+    off = off_walls(c, cut.free[b, v], green)
+    edge = wp.length(at_edges(off, cut.free[b, v], green))
     lifted = int(0)
     deep = float(0.0)
     if green.has_face != 0:
@@ -395,7 +427,8 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     cut.lifted[i, v] = lifted
     cut.extent[i, v] = size
     cut.softening_length[i, v] = scale * shapes.softening_length[k]
-    cut.outside_fraction[i, v] = smooth(wp.max(off / (_WALL_FADE_LENGTH * green.extent), deep))
+    cut.outside_fraction[i, v] = smooth(wp.max(wp.length(off), deep))
+    cut.barrier[i, v] = barrier(cut.outside_fraction[i, v], smooth(wp.max(edge, deep)), size)
     away = wp.length(off_box(0.5 * (points[0] + points[3]), green.box0, green.box1))
     cut.near[i, v] = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
 
@@ -420,8 +453,7 @@ def weigh(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
             x = cut.outside_fraction[i, v]
             cut.out[i, v] = x
             walled = wp.where(x > 0.0 and cut.lossy[v] == 0, 1, walled)
-            stiff = _WALL_PENALTY * x * x * x * cut.extent[i, v]
-            cut.weight[i, v] = shapes.charge[k] / (1.0 + stiff)
+            cut.weight[i, v] = shapes.charge[k] / (1.0 + cut.barrier[i, v] * cut.extent[i, v])
     cut.width[v] = _WIDTH * passes
     cut.walled[v] = walled
     for b in range(places.group.shape[0]):

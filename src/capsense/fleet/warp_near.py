@@ -165,6 +165,8 @@ def connect(places: Places, cut: WarpActiveTree, terminals: int):
             if tie[1] != 0.0 or places.inverse_susceptibility[e, b][1] != 0.0:
                 lossy = 1
         cut.leader[b, v] = leader
+        conducts = places.inverse_susceptibility[e, b] == wp.vec2()
+        cut.free[b, v] = wp.where(conducts and (neutral != 0 or tie[0] > 0.0), 1, 0)
         cut.ground_elastance[b, v] = tie
         cut.slot[b, v] = -1
     cut.lossy[v] = lossy

@@ -48,6 +48,8 @@ def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     (out.box0, out.box1), (out.room0, out.room1) = (
         (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.active_bounds)
     )
+    walls = np.array([green.space.inner, green.space.fade], np.float32)
+    out.walls = wp.array(walls, dtype=wp.vec3, device=device)
     return out
 
 

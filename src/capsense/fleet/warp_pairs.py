@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import warp as wp
 
+from capsense.field.face_kernels import FADED, WALL_PENALTY
 from capsense.field.green_kernels import LEAST
 from capsense.fleet.warp_cut import (
     WIDTH,
     Response,
     WarpActiveTree,
+    at_edges,
     four,
     idle,
     lift_back,
     off_box,
+    off_walls,
     row,
     smooth,
 )
-from capsense.solver.interaction.pair_kernels import WALL_PENALTY, WIDE_CLUSTER
+from capsense.solver.interaction.pair_kernels import WIDE_CLUSTER
 from capsense.solver.tree.mean_kernels import FAR
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -35,6 +38,7 @@ _WALL_PENALTY, _STIFF = wp.constant(WALL_PENALTY), wp.constant(600.0)
 """Energy of charge that is out of reach [1/m]; with losses at most the second number [m] over the
 square of a large cluster's extent: more of it would hide what is in reach, see ``warp_cut.weigh``.
 """
+_FADED = wp.constant(FADED)
 _OF_ITSELF = wp.constant(0.9)
 """Clusters at a wall meet their images at most so much, over how they meet themselves."""
 _NEAR_LEAST, _FAR_LEAST = wp.constant(LEAST[0]), wp.constant(LEAST[-1])
@@ -50,7 +54,16 @@ class Leaf:
     extent: wp.float32
     softening_length: wp.float32
     outside_fraction: wp.float32
+    barrier: wp.float32
+    free: wp.int32
     near: wp.float32
+
+
+@wp.func
+def body_of(cut: WarpActiveTree, leaf: int):
+    """Whose leaf it is."""
+    n = cut.number.shape[0]
+    return wp.where(leaf < n, leaf // cut.clusters, (leaf - n) // (2 * cut.clusters))
 
 
 @wp.func
@@ -64,14 +77,9 @@ def leaf_of(cut: WarpActiveTree, i: int, v: int):
     out.softening_length = cut.softening_length[i, v]
     out.outside_fraction = cut.outside_fraction[i, v]
     out.near = cut.near[i, v]
+    out.barrier = cut.barrier[i, v]
+    out.free = cut.free[body_of(cut, i), v]
     return out
-
-
-@wp.func
-def body_of(cut: WarpActiveTree, leaf: int):
-    """Whose leaf it is."""
-    n = cut.number.shape[0]
-    return wp.where(leaf < n, leaf // cut.clusters, (leaf - n) // (2 * cut.clusters))
 
 
 @wp.func
@@ -216,11 +224,10 @@ def pairs(green: Response, cut: WarpActiveTree, out: wp.array3d(dtype=wp.float32
         elif i != j and leaf.lifted + cut.lifted[j, v] > 0:
             value += more(leaf, cut, j, v)
         if i == j:
-            x = cut.outside_fraction[i, v]
-            barrier = _WALL_PENALTY
+            held = cut.barrier[i, v]
             if cut.walled[v] == 0:
-                barrier = wp.min(barrier, _STIFF / (cut.extent[i, v] * cut.extent[i, v]))
-            value += barrier * x * x * x
+                held = wp.min(held, _STIFF / (cut.extent[i, v] * cut.extent[i, v]))
+            value += held
     out[i, j, v] = value
     out[j, i, v] = value
 
@@ -318,12 +325,39 @@ def _source(p: wp.vec3, source: wp.vec3, floor: float, least: float):
 
 
 @wp.func
+def wall_slope(green: Response, leaf: Leaf, origin: wp.vec3):
+    """How much further out of reach a leaf is as it moves along x, y, z and turns about them."""
+    c = 0.5 * (leaf.points[0] + leaf.points[3])
+    off = off_walls(c, leaf.free, green)
+    way = wp.length(off)
+    slope = wp.vec3()
+    if way < 1.0 and leaf.outside_fraction < 1.0:
+        for i in range(3):
+            side = wp.where(off[i] < 0.0, 0, 1)
+            slope[i] = 6.0 * (1.0 - way) * off[i] / green.walls[1, leaf.free, side][i]
+    return wp.spatial_vector(slope, wp.cross(c - origin, slope))
+
+
+@wp.func
+def barrier_slope(green: Response, leaf: Leaf):
+    """How the energy that keeps charge off a leaf grows as it comes further out of reach."""
+    x = leaf.outside_fraction
+    y = wp.max(1.0 - x, 1.0e-6)
+    off = off_walls(0.5 * (leaf.points[0] + leaf.points[3]), leaf.free, green)
+    if wp.length(at_edges(off, leaf.free, green)) >= wp.length(off):
+        return 3.0 * _WALL_PENALTY * x * x
+    return wp.where(x * x < _FADED * y, x * (2.0 - x) / (y * y * leaf.extent), 0.0)
+
+
+@wp.func
 def source_forces(
     green: Response, leaf: Leaf, strength: wp.array3d(dtype=wp.float32), origin: wp.vec3,
     first: int, v: int,
 ):  # fmt: skip
     """Forces on a leaf, and torques about an origin, by sources: columns from ``first`` on."""
     out = pulls()
+    slope = wall_slope(green, leaf, origin)
+    fading = wp.length_sq(slope) > 0.0
     for s in range(first_source(green, leaf), last_source(green, leaf)):
         force = wp.vec3()
         torque = wp.vec3()
@@ -336,6 +370,8 @@ def source_forces(
             force += pull
             torque += wp.cross(p - origin, pull)
         both = share_of(green, leaf, s) * wp.spatial_vector(force, torque)
+        if fading:
+            both -= seen(green, leaf, s) / (1.0 - leaf.outside_fraction) * slope
         out += wp.outer(columns_of(strength, s, first, v), both)
     return out
 
@@ -417,6 +453,9 @@ def forces(
                 if body_of(cut, j) != body or (i != j and leaf.lifted + cut.lifted[j, v] > 0):
                     pull -= pair_force(green, leaf, cut, j, v, 0.0, origin)
                 total += wp.outer(columns_of(charge, j, first, v), pull)
+        if leaf.barrier > 0.0:
+            pull = -0.5 * barrier_slope(green, leaf) * wall_slope(green, leaf, origin)
+            total += wp.outer(columns_of(charge, i, first, v), pull)
     for c in range(_COLUMNS):
         out[i, first + c, v] = wp.spatial_vector(
             total[c, 0], total[c, 1], total[c, 2], total[c, 3], total[c, 4], total[c, 5]

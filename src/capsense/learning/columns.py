@@ -51,6 +51,7 @@ COLUMNS = {
     "body_eps_r": "relative permittivity of that, B",
     "body_sigma": "conductivity of that, B, S/m",
     "body_grounding": "grounded, floating, local, capacitance or ties, B",
+    "body_conductor": "conductor that it belongs to with others of that name, if any, B",
     "body_earth": "capacitance that ties it to earth, infinite for grounded, B, F",
     "body_local": "capacitance that ties it to the sensor's ground, infinite for local, B, F",
     "body_force": "force that presses it onto the cover, NaN for none given, B, N",
@@ -77,8 +78,8 @@ random value of the file, see :func:`capsense.learning.draws.columns_of`."""
 OF_BODIES: Mapping[str, tuple[Kind, int]] = {
     "present": ("bool", 1), "shape": ("text", 1), "size": ("number", 3), "position": ("number", 3),
     "quaternion": ("number", 4), "material": ("text", 1), "eps_r": ("number", 1),
-    "sigma": ("number", 1), "grounding": ("text", 1), "earth": ("number", 1),
-    "local": ("number", 1), "force": ("number", 1),
+    "sigma": ("number", 1), "grounding": ("text", 1), "conductor": ("text", 1),
+    "earth": ("number", 1), "local": ("number", 1), "force": ("number", 1),
 }  # fmt: skip
 """What is known of each body, of which kind, and how many of them."""
 DRAWN = {
@@ -166,5 +167,6 @@ def _facts(body: Body | None) -> dict[str, Any]:
         "present": True, "shape": kind, "size": size, "position": body.pose.position,
         "quaternion": body.pose.quaternion, "material": body.material.name,
         "eps_r": body.material.eps_r, "sigma": body.material.sigma, "grounding": tied,
-        "earth": earth, "local": local, "force": np.nan if body.force is None else body.force,
+        "conductor": body.conductor, "earth": earth, "local": local,
+        "force": np.nan if body.force is None else body.force,
     }  # fmt: skip

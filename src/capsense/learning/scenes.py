@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -375,8 +375,9 @@ def _limb(table: ScenarioTable) -> list[Body]:
     grounding = read_grounding(table, 100e-12)
     material = read_material(table, "human")
     bodies = limb.bodies(root, bent, degrees=True, material=material, grounding=grounding)
-    names = _names(limb, table.string("name"))
-    return [Body(b.shape, b.pose, b.material, b.grounding, name, b.force)
+    whole = table.string("name")
+    names = _names(limb, whole)
+    return [replace(b, name=name, conductor=b.conductor and whole)
             for name, b in zip(names, bodies, strict=True)]  # fmt: skip
 
 

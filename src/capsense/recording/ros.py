@@ -303,7 +303,7 @@ class StepMessages:
             return number
 
         for body in scene:
-            key = (body.shape, body.material, body.grounding, body.name)
+            key = (body.shape, body.material, body.grounding, body.name, body.conductor)
             number = self._bodies.get(key)
             if number is None:
                 shape = known(body.shape)

@@ -31,7 +31,9 @@ class ScenarioTable(_validate.Table):
 
 
 MESH_KEYS = ("file", "unit")
-BODY_KEYS = ("name", "shape", "material", "grounding", "pose", "trajectory", "force")
+BODY_KEYS = (
+    "name", "shape", "material", "grounding", "conductor", "pose", "trajectory", "force",
+)  # fmt: skip
 MAX_FORCE = 1e6
 """No body is pressed onto a cover by more than this [N]."""
 TRAJECTORY_KEYS = ("waypoints", "speed", "dwell", "euler", "quaternion", "closed")
@@ -69,7 +71,9 @@ def read_body(table: ScenarioTable, name: str, folder: Path) -> MovingBody:
     else:
         pose = read_pose(ScenarioTable(table.data["pose"], table.source, f"{table.item}: pose"))
     force = table.number("force", 0.0, MAX_FORCE, unit="N") if "force" in table else None
-    return MovingBody(Body(shape, pose, material, grounding, name, force), trajectory)
+    conductor = table.string("conductor") if "conductor" in table else None
+    body = Body(shape, pose, material, grounding, name, force, conductor)
+    return MovingBody(body, trajectory)
 
 
 def _read_shape(table: ScenarioTable, shape: str, folder: Path) -> Shape:

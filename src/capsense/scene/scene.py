@@ -33,6 +33,9 @@ class Body:
             same robot; or :class:`~capsense.scene.materials.Ties` to both. It matters for
             conductors only.
         name: Optional; unique within a scene.
+        conductor: Optional; bodies of one name are one conductor, such as the limbs of a person,
+            whether they touch or not. Their grounding is that of the whole conductor, and must be
+            the same. It matters for conductors only.
         force: Normal force that presses it onto the cover of a design [N], such as the contact
             force of a simulator; it then decides how deep the body lies in the cover, whatever the
             height of its pose. By default the overlap with the cover does.
@@ -47,6 +50,7 @@ class Body:
     grounding: Grounding
     name: str | None
     force: float | None
+    conductor: str | None
 
     def __init__(
         self,
@@ -56,6 +60,7 @@ class Body:
         grounding: Grounding = "grounded",
         name: str | None = None,
         force: float | None = None,
+        conductor: str | None = None,
     ) -> None:
         if not isinstance(shape, Shape):
             mesh = hasattr(shape, "vertices") and hasattr(shape, "faces")
@@ -65,8 +70,9 @@ class Body:
                 else ("Box, Sphere, Capsule, Cylinder, Ellipsoid or TriMesh")
             )
             raise SceneError(f"shape is {shape!r}; give a {fix}")
-        if not (name is None or (isinstance(name, str) and name)):
-            raise SceneError(f"body name is {name!r}; give a non-empty string or None")
+        for what, given in (("body name", name), ("conductor", conductor)):
+            if not (given is None or (isinstance(given, str) and given)):
+                raise SceneError(f"{what} is {given!r}; give a non-empty string or None")
         fields = self.__dict__
         fields["shape"] = shape
         fields["pose"] = checked_pose(pose)
@@ -74,6 +80,7 @@ class Body:
         fields["grounding"] = checked_grounding(grounding)
         fields["name"] = name
         fields["force"] = checked_force(force)
+        fields["conductor"] = conductor
 
     def pressed(self, force: float | None) -> Body:
         """Return the same body under a normal force [N]; the rest is shared.
@@ -209,7 +216,8 @@ class Scene:
         bodies: The bodies, any iterable.
 
     Raises:
-        SceneError: Something is not a :class:`Body`, or two bodies share a name.
+        SceneError: Something is not a :class:`Body`, two bodies share a name, or bodies of one
+            conductor have different groundings.
     """
 
     bodies: tuple[Body, ...]
@@ -222,6 +230,7 @@ class Scene:
         except TypeError:
             raise SceneError(f"Scene takes a list of bodies, not {bodies!r}") from None
         names: set[str] = set()
+        grounding: dict[str, Grounding] = {}
         for i, body in enumerate(items):
             if not isinstance(body, Body):
                 fix = f"; write Body({body!r}, ...)" if isinstance(body, Shape) else ""
@@ -230,6 +239,13 @@ class Scene:
                 if body.name in names:
                     raise SceneError(f"two bodies are named {body.name!r}; names must differ")
                 names.add(body.name)
+            if body.conductor is not None:
+                first = grounding.setdefault(body.conductor, body.grounding)
+                if first != body.grounding:
+                    raise SceneError(
+                        f"bodies of conductor {body.conductor!r} have groundings {first!r} and "
+                        f"{body.grounding!r}; give all of them that of the whole conductor"
+                    )
         self.__dict__["bodies"] = items
 
     def __repr__(self) -> str:

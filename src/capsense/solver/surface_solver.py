@@ -15,7 +15,7 @@ from capsense.constants import UNIT
 from capsense.design.model import Design
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.face import sheet_on_face
-from capsense.field.face_kernels import WALL_FADE_LENGTH
+from capsense.field.face_kernels import WALL_EDGE
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
 from capsense.field.green_points import narrowest_width
@@ -39,6 +39,7 @@ from capsense.solver.packing import (
     same,
 )
 from capsense.solver.system.lossy import solve_lossy
+from capsense.solver.system.network_kernels import tie_what_is_outside
 from capsense.solver.system.step import (
     DIFFERENCE,
     Solution,
@@ -197,7 +198,7 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain, over ``length``, as :func:`windowed` takes them."""
-        self._sight = self.green.active_bounds + WALL_FADE_LENGTH * self.green.extent * np.array(
+        self._sight = self.green.active_bounds + WALL_EDGE * self.green.extent * np.array(
             [[-1.0], [1.0]]
         )
         """Corners of the box beyond which no charge is, over ``length``, shape (2, 3)."""
@@ -359,9 +360,21 @@ class SurfaceSolver:
     def look(self, scene: Scene) -> View:
         """Find the bodies of a scene that reach into the domain."""
         packed = scene.pack()
-        met = overlapping(packed.bounds, *(self.length * self._sight))
-        matter = self.matter_of([scene[k] for k in met.tolist()])
+        met = self._with_conductors(scene, overlapping(packed.bounds, *(self.length * self._sight)))
+        matter = self.matter_of(list(scene)).repeated(met.tolist())
         return View(scene, packed, met, matter)
+
+    @staticmethod
+    def _with_conductors(scene: Scene, met: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Bodies that are met, and what else there is of conductors that are not at ground."""
+        names = {scene[k].conductor for k in met.tolist()} - {None}
+        if not names:
+            return met
+        more = [
+            k for k, body in enumerate(scene)
+            if body.conductor in names and body.grounding != "grounded"
+        ]  # fmt: skip
+        return np.union1d(met, np.array(more, met.dtype))
 
     def matter_of(self, bodies: Sequence[Body]) -> Matter:
         """What bodies are made of, with lengths as kernels take them."""
@@ -392,9 +405,12 @@ class SurfaceSolver:
             return bodies, None
         matter = bodies.matter
         if matter.lossy:
+            ties = matter.ties(sizes_of(bodies.records, bodies.shapes))
+            free = (bodies.records["free"] != 0) & (bodies.records["neutral"] == 0)
+            ties = np.where(free, bodies.records["ground_elastance"], ties)
             out = solve_lossy(
-                bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)),
-                matter.inverse_susceptibility, self.green, preset.threshold, preset.width,
+                bodies.records, ties, matter.inverse_susceptibility, self.green,
+                preset.threshold, preset.width,
             )  # fmt: skip
         else:
             out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
@@ -485,6 +501,7 @@ class SurfaceSolver:
         for i, at in offsets:
             shift[i] = rotation[i] @ at
             records["position"][i] += shift[i]
+        tie_what_is_outside(records, self.green.space)
         out = PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
         if not laid.rigid:
             out.find_near(self.green)

@@ -334,7 +334,10 @@ def _alike(old: Scene, new: Scene) -> Scene:
 
     def known(body: Body) -> Body:
         b = before.get(body.name, body)
-        same = (b.shape, b.material, b.grounding) == (body.shape, body.material, body.grounding)
+        same = all(
+            getattr(b, what) == getattr(body, what)
+            for what in ("shape", "material", "grounding", "conductor")
+        )
         return b.moved(body.pose).pressed(body.force) if same else body
 
     return Scene([known(body) for body in new])

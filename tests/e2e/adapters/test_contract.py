@@ -180,22 +180,23 @@ def test_materials_and_grounding_by_name(
     assert difference(sensor.read(), plain) < shape_way.same
 
 
-def test_a_capacitance_to_ground_is_shared(
+def test_what_a_rule_gives_a_capacitance_is_one_conductor(
     shape_way: Way, shapes_in: SensorIn, tiny_simulator: cs.Simulator
 ) -> None:
-    """The things of one pattern are one body; what is not seen has no share."""
+    """Whether they touch or not, and whatever of it is seen."""
     half = cs.Box((0.02, 0.03, 0.01))
     things = [
-        Thing("arm_a", half, cs.Pose((-0.0099, 0, 0.03))),
-        Thing("arm_b", half, cs.Pose((0.0099, 0, 0.03))),
+        Thing("arm_a", half, cs.Pose((-0.0110, 0, 0.03))),
+        Thing("arm_b", half, cs.Pose((0.0110, 0, 0.03))),
         Thing("arm_far", half, cs.Pose((0.5, 0, 0.03))),
     ]
     sensor = shapes_in(things, cs.Pose(), grounding={"arm_*": 3e-15})
-    assert [b.grounding for b in sensor.scene()] == approx([1.5e-15] * 2, abs=0)
+    assert [b.grounding for b in sensor.scene()] == [3e-15] * 2
     reading = sensor.read()
-    pair = plain_reading(things[:2], cs.Pose(), tiny_simulator, grounding=1.5e-15)
+    options = {"grounding": 3e-15}
+    pair = plain_reading(things[:2], cs.Pose(), tiny_simulator, **options, conductor="arm")
     assert difference(reading, pair) < shape_way.same
-    each = plain_reading(things[:2], cs.Pose(), tiny_simulator, grounding=3e-15)
+    each = plain_reading(things[:2], cs.Pose(), tiny_simulator, **options)
     assert difference(reading, each) > 10 * shape_way.same
 
 

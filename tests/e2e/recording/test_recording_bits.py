@@ -46,6 +46,8 @@ def test_bodies(body: cs.Body) -> None:
     again = through(body)
     assert again.material == body.material
     assert (again.grounding, again.name) == (body.grounding, body.name)
+    assert again.conductor is body.conductor is None
+    assert through(dataclasses.replace(body, conductor="p")).conductor == "p"
     if isinstance(body.shape, cs.TriMesh):
         np.testing.assert_array_equal(again.shape.vertices, body.shape.vertices)
         np.testing.assert_array_equal(again.shape.faces, body.shape.faces)

@@ -70,7 +70,7 @@ def _apart(found: Array, wanted: Array) -> float:
 @pytest.mark.e2e
 def test_agrees_with_energies_of_moved_charges(name: str) -> None:
     bodies, solution, found = _solved(name, 0.015)
-    wanted = gradient_twin.jacobian(solution, bodies["position"], green_of())
+    wanted = gradient_twin.jacobian(solution, bodies, green_of())
     assert _apart(found, wanted) < 1e-5
 
 

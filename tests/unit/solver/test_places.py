@@ -12,7 +12,7 @@ from plain_leaves import plain_leaves
 from surface_scenes import Placed, green_of, pack, shape_of
 
 import capsense as cs
-from capsense.field.face_kernels import lift, outside_fraction
+from capsense.field.face_kernels import barrier, barrier_slope, fading, lift, out_of_reach
 from capsense.field.green import LEVELS
 from capsense.field.green_kernels import Green, distances, level_share, pack_green
 from capsense.solver.gap.body_gap_kernels import facing_of
@@ -146,14 +146,52 @@ def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) 
         green.active_bounds, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]]
     )
     assert green.space.has_face
-    assert outside_fraction(around(np.array(center)), green.space, np.empty(3)) == approx(
-        expected, abs=1e-9
-    )
+    x, held = out_of_reach(around(np.array(center)), 0, green.space, np.empty(3))
+    assert x == held == approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("center", "whole", "held"),
+    [((0.0, 0.0, 0.1), 0.0, 0.0), ((0.2, 0.0, 0.1), 0.0, 0.0), ((0.22, 0.0, 0.1), 0.5, 0.0),
+     ((0.0, -0.24, 0.1), 1.0, 0.0), ((0.0, 0.0, 0.46), 0.5, 0.0), ((0.0, 0.0, 0.48), 1.0, 0.0),
+     ((0.1, 0.0, -0.0125), 0.5, 0.5), ((0.0, 0.0, -4.2 * H0), 0.5, 0.5)],
+)  # fmt: skip
+def test_conductors_not_at_ground_fade_out_early(center: tuple, whole: float, held: float) -> None:
+    """Analytic: over 40 mm up to 10 mm before walls, but not at the floor or behind the face."""
+    green = with_validity(green_of())
+    found = out_of_reach(around(np.array(center)), 1, green.space, np.empty(3))
+    np.testing.assert_allclose(found, (whole, held), rtol=0, atol=1e-9)
+
+
+def test_walls_next_to_a_design_fade_all_bodies_alike() -> None:
+    """Invariant: the box in which bodies are whole holds the design, with the fade around it."""
+    room = np.array([[-0.02, -0.3, -0.01], [0.3, 0.3, 0.3]])
+    box = np.array([[-0.005, -0.1, 0.0], [0.1, 0.29, 0.001]])
+    inner, fade = fading(room, box, 0.3)
+    np.testing.assert_allclose(fade[0], 3e-3)
+    np.testing.assert_array_equal(inner[0], room)
+    np.testing.assert_allclose(fade[1], [[3e-3, 0.024, 3e-3], [0.024, 3e-3, 0.024]])
+    np.testing.assert_allclose(inner[1], [[-0.02, -0.279, -0.01], [0.279, 0.3, 0.279]])
+
+
+@pytest.mark.parametrize("held", [None, 0.0])
+def test_barrier_rises_by_its_slope(held: float | None) -> None:
+    """Differential: central differences; it is 0 within reach, and never falls."""
+    x = np.linspace(0.0, 0.99, 34)
+    values = np.array([barrier(v, v if held is None else held, 0.03) for v in x])
+    assert values[0] == 0.0
+    assert (np.diff(values) > 0.0).all()
+    step = 1e-6
+    for v in x[1:]:
+        low, high = (barrier(w, w if held is None else held, 0.03) for w in (v - step, v + step))
+        slope = barrier_slope(v, v if held is None else held, 0.03)
+        np.testing.assert_allclose((high - low) / (2 * step), slope, rtol=1e-5)
+    assert barrier_slope(1.0, 0.0, 0.03) == 0.0
 
 
 def outside(center: Array, green: Green) -> float:
-    """The outside fraction of four points with a centre."""
-    return outside_fraction(around(center), green.space, np.empty(3))
+    """The outside fraction of four points with a centre, of a body at ground."""
+    return out_of_reach(around(center), 0, green.space, np.empty(3))[0]
 
 
 def around(center: Array) -> Array:
@@ -168,7 +206,7 @@ def test_behind_the_face_near_a_side(axis: int, side: int) -> None:
     green = with_validity(green_of())
     center = np.array([0.0, 0.0, float(green.box[1, 2]) - 0.008])
     center[axis] = green.box[side, axis] + (4.2 * H0 / 4) * (1 - 2 * side)
-    assert outside_fraction(around(center), green.space, np.empty(3)) == approx(0.5, abs=1e-9)
+    assert outside(center, green) == approx(0.5, abs=1e-9)
 
 
 def test_distance_of_clusters_from_the_design() -> None:
@@ -186,7 +224,7 @@ def test_designs_without_a_face_lift_nothing() -> None:
     cut = chosen(bodies, green, 0.015, 2.5, facing_of(bodies[:0]))
     leaves = placed(bodies, cut, green)
     np.testing.assert_array_equal(leaves.points, leaves.true)
-    assert outside_fraction(np.array([(0.0, 0.0, -0.009)] * 4), green.space, np.empty(3)) == 0.0
+    assert outside(np.array((0.0, 0.0, -0.009)), green) == 0.0
 
 
 @pytest.mark.parametrize("has_face", [True, False])
@@ -244,13 +282,12 @@ def test_lifted_clusters_of_a_body_meet_where_they_are() -> None:
 def test_charge_out_of_reach_has_a_large_energy() -> None:
     """Analytic: 1e5 per metre times the third power of how far it is beyond."""
     points = np.random.default_rng(4).uniform(-0.01, 0.01, (3, 4, 3))
-    none, owner = np.zeros(3), np.zeros(3, int)
-    reach, size = np.array([0.0, 0.5, 1.0]), np.full(3, 4e-3)
-    first, second = (
-        leaf_pairs(plain_leaves(points, points, size, size, r, owner, none), -1e5)
-        for r in (none, reach)
-    )
-    np.testing.assert_allclose(second - first, np.diag(1e5 * reach**3), rtol=1e-6, atol=0.01)
+    none, owner, size = np.zeros(3), np.zeros(3, int), np.full(3, 4e-3)
+    energy = np.array([barrier(x, x, 4e-3) for x in (0.0, 0.5, 1.0)])
+    np.testing.assert_allclose(energy, [0.0, 12500.0, 1e5])
+    leaves = plain_leaves(points, points, size, size, none, owner, none)
+    first, second = (leaf_pairs(leaves._replace(barrier=e), -1e5) for e in (none, energy))
+    np.testing.assert_allclose(second - first, np.diag(energy), rtol=1e-6, atol=0.01)
 
 
 @pytest.mark.parametrize("height", [3e-4, 1e-3, 3e-3, 8e-3])

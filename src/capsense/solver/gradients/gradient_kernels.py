@@ -10,7 +10,9 @@ table of sources. Only sums over a body enter, so forces are summed source by so
 
   dΔC_ij = Σ_s (Σ_p q_i(p) ∇b_s(p)) c_sj,  plus the same with i and j exchanged
 
-and the force of a source on a body passes through that source, which gives the torque.
+and the force of a source on a body passes through that source, which gives the torque. Leaves that
+fade out before a wall see the design by a share 1 - x, and have an energy of their own for it; both
+change with where they are.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ import numpy as np
 
 from capsense._dense import multiply, multiply_simd
 from capsense._jit import compiled, kernel
+from capsense.field.face_kernels import barrier_slope, off_walls, smooth
 from capsense.field.green_kernels import distances, level_share
 from capsense.solver.placement.placement_kernels import (
+    leaf_rows,
     near_pairs,
     pair_line,
     source_lines,
@@ -52,7 +56,9 @@ def jacobian(solution, bodies, green):
     for b in range(count):
         bounds[b + 1] = max(bounds[b], bounds[b + 1])
     work = np.zeros((count, 6, phi_columns, phi_columns), np.float32)
-    _add_design(points, charge, bounds, green, work)
+    fade, held, slope = _faded(solution, bodies, green.space)
+    right = _add_design(points, charge, fade, bounds, green, work)
+    _add_fading(solution, fade, held, slope, right, green, work)
     _add_pairs(solution, bounds, green.floor, work)
     out = np.empty((count, m, m, 6))
     for b in range(count):
@@ -70,8 +76,73 @@ def jacobian(solution, bodies, green):
 
 
 @compiled
-def _add_design(points, charge, bounds, green, work):
-    """Add forces and torques by the design's sources, (b, 6, lead, lead)."""
+def _faded(solution, bodies, space):
+    """How far leaves are faded out before walls, (l,), as ``off_walls``; its slope, (l, 3).
+
+    Those that are beyond them carry no charge.
+    """
+    points = solution.points
+    n = points.shape[0]
+    fade, held, slope = np.zeros(n), np.zeros(n), np.zeros((n, 3))
+    for j in range(n):
+        c = 0.5 * (points[j, 0] + points[j, 3])
+        free = bodies[solution.owner[j]].free
+        inner, length = space.inner[free], space.fade[free]
+        off, edge = off_walls(c[0], c[1], c[2], free, space)
+        fade[j], held[j] = smooth(off), smooth(edge)
+        if 0.0 < off < 1.0:
+            for i in range(3):
+                low = max(inner[0, i] - c[i], 0.0) / length[0, i] ** 2
+                high = max(c[i] - inner[1, i], 0.0) / length[1, i] ** 2
+                slope[j, i] = 6.0 * (1.0 - off) * (high - low)
+    return fade, held, slope
+
+
+@compiled
+def _add_fading(solution, fade, held, slope, right, green, work):
+    """Add forces and torques by what leaves fade out in."""
+    n, phi_columns = fade.shape[0], right.shape[1]
+    some = np.empty(n, np.int64)
+    count = 0
+    for j in range(n):
+        if 0.0 < fade[j] < 1.0:
+            some[count] = j
+            count += 1
+    if count == 0:
+        return
+    points = np.empty((count, 4, 3))
+    for k in range(count):
+        for q in range(4):
+            for i in range(3):
+                points[k, q, i] = solution.points[some[k], q, i]
+    rows = leaf_rows(points, np.zeros(count), green)
+    for k in range(count):
+        j = some[k]
+        b, x, charge = solution.owner[j], fade[j], solution.charge[j]
+        energy = 0.5 * barrier_slope(x, held[j], solution.extent[j])
+        c = 0.5 * (points[k, 0] + points[k, 3])
+        s = slope[j]
+        six = (
+            s[0], s[1], s[2],
+            c[1] * s[2] - c[2] * s[1], c[2] * s[0] - c[0] * s[2], c[0] * s[1] - c[1] * s[0],
+        )  # fmt: skip
+        for o in range(phi_columns):
+            seen = 0.0
+            for w in range(rows.shape[1]):
+                seen += rows[k, w] * right[w, o]
+            for i in range(phi_columns):
+                value = np.float32(charge[i] * (seen + energy * charge[o]))
+                for r in range(6):
+                    work[b, r, i, o] -= np.float32(six[r]) * value
+
+
+@compiled
+def _add_design(points, charge, fade, bounds, green, work):
+    """Add forces and torques by the design's sources, (b, 6, lead, lead).
+
+    Returns:
+        What the columns of leaves' rows give for the potential of each terminal, (w, lead).
+    """
     n, phi_columns, floor = points.shape[0], charge.shape[1], green.floor
     distance, share = distances(points, green), np.empty(n)
     modes = np.zeros((phi_columns, green.levels[0].table.shape[1]), np.float32)
@@ -79,7 +150,7 @@ def _add_design(points, charge, bounds, green, work):
     for k in range(len(green.levels)):
         level = green.levels[k]
         for j in range(n):
-            share[j] = level_share(distance[j], k, green.blends)
+            share[j] = level_share(distance[j], k, green.blends) * (1.0 - fade[j])
         sums[k] = _source_sums(points, charge, share, bounds, level, floor)
         _add_modes(sums[k], level.table, modes)
     right = np.zeros((modes.shape[1], phi_columns), np.float32)
@@ -89,6 +160,7 @@ def _add_design(points, charge, bounds, green, work):
             right[k, i] = modes[i, k]
     for k in range(len(green.levels)):
         _add_work(sums[k], green.levels[k].sources, green.levels[k].table, right, work)
+    return right
 
 
 @compiled

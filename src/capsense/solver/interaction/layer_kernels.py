@@ -16,7 +16,7 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles
-from capsense.field.face_kernels import WALL_FADE_LENGTH, keep_off, smooth
+from capsense.field.face_kernels import keep_off, off_walls, smooth
 from capsense.solver.placement.placement_kernels import ActiveClusters
 from capsense.solver.selection.evaluation_kernels import far_potentials
 
@@ -51,6 +51,7 @@ def faces_of(leaves):
     extent, soft, beyond = np.empty(count), np.empty(count), np.empty(count)
     owner, within = np.empty(count, np.int64), np.empty(count)
     known, size = np.empty((count, 2), np.int64), np.empty(count)
+    barrier = np.empty(count)
     for j in range(n):
         for i in range(first[j], first[j + 1]):
             sign = 1.0 - 2.0 * (i - first[j])
@@ -63,7 +64,10 @@ def faces_of(leaves):
             beyond[i], owner[i] = leaves.outside_fraction[j], leaves.owner[j]
             within[i], size[i] = leaves.self_interaction_weight[j], leaves.size[j]
             known[i, 0], known[i, 1] = leaves.table_rows[j, 0], leaves.table_rows[j, 1]
-    faces = ActiveClusters(points, true, extent, soft, beyond, owner, within, known, size, offset)
+            barrier[i] = leaves.barrier[j]
+    faces = ActiveClusters(
+        points, true, extent, soft, beyond, owner, within, known, size, offset, barrier
+    )
     return faces, first
 
 
@@ -159,16 +163,14 @@ def _add_pieces(body, green, out):
         o, q = 13 * (c // 3), 3 * (c % 3)
         area = pieces[o + 12] * body.scale * body.scale
         arm = max(body.layer * body.scale, _ARM * math.sqrt(area))
-        beyond = 0.0
         for i in range(3):
             point[0, i], normal[i] = body.position[i], 0.0
             for k in range(3):
                 turn = body.rotation[i, k]
                 point[0, i] += body.scale * turn * pieces[o + q + k]
                 normal[i] += turn * pieces[o + 9 + k]
-            low, high = space.active_bounds[0, i], space.active_bounds[1, i]
-            beyond += max(low - point[0, i], point[0, i] - high, 0.0) ** 2
-        share = 1.0 - smooth(math.sqrt(beyond) / (WALL_FADE_LENGTH * space.extent))
+        off, _ = off_walls(point[0, 0], point[0, 1], point[0, 2], body.free, space)
+        share = 1.0 - smooth(off)
         if share == 0.0:
             continue
         if space.has_face:

@@ -33,8 +33,6 @@ from capsense.solver.tree.mean_kernels import (
     rectangles,
 )
 
-WALL_PENALTY = 1e5
-"""Energy of charge that is out of reach [1/m]."""
 LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
 WIDE_CLUSTER = 4.0
@@ -80,7 +78,7 @@ def leaf_pairs(leaves, floor):
             if far_means(shapes, i, shapes, behind, line):
                 _near_means(flat, i, flat, behind, line, room)
             add_line(line, 1.0, (np.int64(0), behind), out, i)
-        out[i, i] += WALL_PENALTY * leaves.outside_fraction[i] ** 3
+        out[i, i] += leaves.barrier[i]
     tables, start = (
         (shapes, rectangles(points, leaves.self_interaction_weight), leaves.table_rows),
         np.int64(0),

@@ -30,7 +30,7 @@ from capsense._simd import (
     wide_span,
     wide_splat,
 )
-from capsense.field.face_kernels import keep_off, outside_fraction
+from capsense.field.face_kernels import barrier, keep_off, out_of_reach
 from capsense.field.green_kernels import distances, level_share, source_potentials
 from capsense.solver.selection.evaluation_kernels import put_offset
 from capsense.solver.tree.mean_kernels import extent_of, quadrature4
@@ -48,7 +48,7 @@ class ActiveClusters(NamedTuple):
     softening_length: NDArray[Any]
     """Distances below which 1/r from their points is bounded [m], shape (l,)."""
     outside_fraction: NDArray[Any]
-    """How far each is out of reach, 0 to 1, see ``face_kernels.outside_fraction``, shape (l,)."""
+    """How far each is out of reach, 0 to 1, see ``face_kernels.out_of_reach``, shape (l,)."""
     owner: NDArray[Any]
     """Body of each, ascending, shape (l,)."""
     self_interaction_weight: NDArray[Any]
@@ -60,6 +60,9 @@ class ActiveClusters(NamedTuple):
     """How many times as large as in such a table the body of each is, shape (l,)."""
     offset: NDArray[Any]
     """From the middle of a layer of dipoles to its front [m]; zero of charges; shape (l, 3)."""
+    barrier: NDArray[Any]
+    """Energy that keeps charge off each that is out of reach, see ``face_kernels.barrier`` [1/m],
+    shape (l,)."""
 
 
 @compiled
@@ -69,6 +72,7 @@ def placed(bodies, cut, green):
     leaves = ActiveClusters(
         np.empty((n, 4, 3)), np.empty((n, 4, 3)), np.empty(n), np.empty(n), np.empty(n),
         np.empty(n, np.int64), np.zeros(n), np.full((n, 2), -1), np.empty(n), np.zeros((n, 3)),
+        np.empty(n),
     )  # fmt: skip
     _fill_leaves(bodies, cut, green, leaves, (np.empty((3, 3)), np.empty((3, 3)), np.empty(3)))
     return leaves
@@ -113,7 +117,9 @@ def _fill_leaves(bodies, cut, green, leaves, room):
         for q in range(4):
             for i in range(3):
                 corners[q, i] = points[q, i]  # before it is lifted
-        leaves.outside_fraction[j] = outside_fraction(points, space, middle)
+        beyond, held = out_of_reach(points, body.free, space, middle)
+        leaves.outside_fraction[j] = beyond
+        leaves.barrier[j] = barrier(beyond, held, extent)
         if space.has_face:
             keep_off(points, space)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from capsense._dense import padded
 from capsense._jit import compiled, kernel
 from capsense._simd import WIDE, doubles, integers
-from capsense.field.face_kernels import WALL_FADE_LENGTH, keep_off, on_face, smooth
+from capsense.field.face_kernels import keep_off, off_walls, on_face, smooth
 from capsense.field.green_kernels import point_potentials
 from capsense.field.grid_kernels import grid_values, to_grid
 
@@ -125,21 +125,21 @@ def place(body, space, k, points, found, middle):
 
     Returns:
         Square of its distance from the design [m²]; how high above its box it is [m]; how far it is
-        from the next wall, negative beyond it, and how far it is beyond all of them [m].
+        from the next wall, negative beyond it [m]; and :func:`off_walls`.
     """
-    center, out, room = doubles(body.center), 0.0, math.inf
+    center, room = doubles(body.center), math.inf
     for i in range(3):
         x = body.position[i]
         for q in range(3):
             x += body.scale * body.rotation[i, q] * center[3 * k + q]
         middle[i] = points[found, i] = x
         room = min(room, x - space.active_bounds[0, i], space.active_bounds[1, i] - x)
-        out += max(space.active_bounds[0, i] - x, x - space.active_bounds[1, i], 0.0) ** 2
+    out, _ = off_walls(middle[0], middle[1], middle[2], body.free, space)
     square, height = face_distance(middle, space)
     if square < 4.0 * space.validity * space.validity and space.has_face:
         keep_off(points[found : found + 1], space)
         square, height = face_distance(points[found], space)
-    return square, height, room, math.sqrt(out) if out > 0.0 else 0.0
+    return square, height, room, out
 
 
 @kernel
@@ -242,7 +242,7 @@ def _look_into(body, green, coarser, looks, start, wanted):
         size, (square, height, room, out) = (
             body.scale * extent[k], place(body, space, k, points, found, middle),
         )  # fmt: skip
-        share = 1.0 - smooth(out / (WALL_FADE_LENGTH * space.extent)) if out > 0.0 else 1.0
+        share = 1.0 - smooth(out)
         looks.wall_crossing_weight[row] = looks.linearity[row] = 0.0
         if size > max(LONG[0] * space.extent, 2.0 * abs(room)):
             looks.wall_crossing_weight[row] = smooth(2.0 - 4.0 * abs(room) / size) * smooth(

@@ -8,7 +8,7 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
-from capsense.field.face_kernels import WALL_FADE_LENGTH, smooth
+from capsense.field.face_kernels import smooth
 from capsense.solver.selection.evaluation_kernels import (
     far_potentials,
     look,
@@ -305,7 +305,7 @@ def _score_nodes(body, green, nodes, looks, last, weight):
         square, height, _, out = place(body, space, looks.node[rows[j]], points, j, middle)
         size = body.scale * doubles(body.extent)[looks.node[rows[j]]]
         looks.screening_factor[rows[j]] = screening(space.has_face, size, square, height)
-        inner[j] = 1.0 - smooth(out / (WALL_FADE_LENGTH * space.extent))
+        inner[j] = 1.0 - smooth(out)
     far_potentials(points, rows, inner, green, looks.means)
     for k in nodes:
         looks.score[k] = _share(looks, k) * _own_score(body, looks, k, weight)

@@ -9,9 +9,62 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._dense import WIDTH, padded
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
+from capsense._simd import doubles, integers
+from capsense.field.face_kernels import off_walls, smooth
 from capsense.solver.system.system_kernels import System
 from capsense.solver.tree.matter import FLOATING_PENALTY
+
+_COARSE = 31
+"""So many clusters, the coarsest ones, tell how far a body is out of reach."""
+
+
+@kernel
+def outside_capacitance(body, space):
+    """Capacitance in free space of what is out of reach of a conductor that is not at ground [m].
+
+    Coarse clusters count by their shares of the charge, as far as they are out of reach.
+    """
+    if body.free == 0:
+        return 0.0
+    children, charge, center = (
+        integers(body.children), doubles(body.charge), doubles(body.center),
+    )  # fmt: skip
+    outside, r, p, s = 0.0, body.rotation, body.position, body.scale
+    for k in range(min(_COARSE, 2 * body.n - 1)):
+        if 0 <= children[2 * k] < _COARSE - 1:  # its parts stand for it
+            continue
+        x, y, z = center[3 * k], center[3 * k + 1], center[3 * k + 2]
+        off, _ = off_walls(
+            p[0] + s * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z),
+            p[1] + s * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z),
+            p[2] + s * (r[2, 0] * x + r[2, 1] * y + r[2, 2] * z),
+            body.free, space,
+        )  # fmt: skip
+        outside += charge[k] * smooth(off)
+    return s * body.capacitance * outside / charge[0]
+
+
+@compiled
+def tie_what_is_outside(bodies, space):
+    """Tie conductors that are not at ground by at least what their parts out of reach have in free
+    space, in place.
+
+    A trunk grounds an arm that floats with it by its own capacitance to everything around, whether
+    the domain reaches as far or not.
+    """
+    count = bodies.shape[0]
+    found = np.zeros(count)
+    for b in range(count):
+        capacitance = outside_capacitance(bodies[b], space)
+        for c in range(count):
+            if bodies[c].group == bodies[b].group:
+                found[c] += capacitance
+    for b in range(count):
+        if found[b] * FLOATING_PENALTY > 1.0:
+            body = bodies[b]
+            if body.neutral != 0 or body.ground_elastance * found[b] > 1.0:
+                body.neutral, body.ground_elastance = 0, 1.0 / found[b]
 
 
 @compiled

@@ -297,6 +297,7 @@ class DynamicBody:
         record = np.zeros(1, BODY)[0]
         record["n"], record["n_panel_clusters"], record["scale"] = n, nodes, 1.0
         record["inside"] = INSIDE if sheet == 0.0 else 0.0
+        record["capacitance"] = self.capacitance
         for name in ("children", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
         self.record = record

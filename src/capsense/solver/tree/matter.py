@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -49,10 +50,11 @@ class Matter:
     eps: Complex
     """Complex relative permittivity, infinite for conductors, shape (n,)."""
     ground: Array
-    """Capacitance to ground [F] over ``unit``; infinite for grounded bodies, 0 for floating ones,
-    shape (n,)."""
+    """Capacitance to ground of the whole conductor that a body belongs to [F] over ``unit``;
+    infinite for grounded bodies, 0 for floating ones, shape (n,)."""
     group: Ints
-    """First of the conductors that a body touches, directly or not; else itself, shape (n,)."""
+    """First body of the conductor that a body belongs to, which are those of one name and those
+    that touch, directly or not; else itself, shape (n,)."""
     unit: float = 1.0
     """Length unit of what follows from ``ground`` [m]."""
     local: Array | None = None
@@ -135,7 +137,7 @@ class Matter:
         first, second = first[~apart], second[~apart]
         ends, radius = _axes(packed, chosen)
         gaps = segment_distance(ends[first], ends[second]) - radius[first] - radius[second]
-        group = np.arange(len(chosen))
+        group = self.group.copy()
         for a, b, gap in zip(first.tolist(), second.tolist(), gaps.tolist(), strict=True):
             if group[a] == group[b]:
                 continue
@@ -166,7 +168,7 @@ class Matter:
         members = np.bincount(self.group, minlength=len(records))[self.group]
         none = np.isinf(ties.real)
         shared = none & (members > 1) & self.conducting
-        records["neutral"] = none & ~shared
+        records["neutral"], records["free"] = none & ~shared, self.free
         records["ground_elastance"] = np.where(
             shared, FLOATING_PENALTY, np.where(none, 0.0, ties.real)
         )
@@ -200,30 +202,41 @@ def matter_of(
 
     ``local`` tells that the sensor has a local ground apart from earth.
     """
-    return _matter(tuple([(b.material, b.grounding) for b in bodies]), frequency, unit, local)
+    known = tuple([(b.material, b.grounding, b.conductor) for b in bodies])
+    return _matter(known, frequency, unit, local)
 
 
 @lru_cache(maxsize=64)
 def _matter(
-    bodies: tuple[tuple[Material, Grounding], ...], frequency: float, unit: float, local: bool
+    bodies: tuple[tuple[Material, Grounding, str | None], ...],
+    frequency: float,
+    unit: float,
+    local: bool,
 ) -> Matter:
-    eps = np.array([material.complex_permittivity(frequency) for material, _ in bodies], complex)
+    eps = np.array([material.complex_permittivity(frequency) for material, _, _ in bodies], complex)
     eps[np.abs(eps) >= CONDUCTING] = np.inf
-    ties = np.array([ties_of(grounding) for _, grounding in bodies], float).reshape(-1, 2)
+    ties = np.array([ties_of(grounding) for _, grounding, _ in bodies], float).reshape(-1, 2)
+    group, members = np.arange(len(bodies)), Counter(name for _, _, name in bodies)
+    first: dict[str, int] = {}
+    for k, (_, _, name) in enumerate(bodies):
+        if name is not None and np.isinf(eps[k].real):
+            group[k] = first.setdefault(name, k)
+        elif name is not None:  # no charge flows through it, so that it has a part of the tie
+            ties[k] /= members[name]
     earth, own = ties.T / unit
-    alone = np.arange(len(bodies))
     if local and own.any():
-        return Matter(eps, earth, alone, unit, own)
-    return Matter(eps, earth + own, alone, unit)
+        return Matter(eps, earth, group, unit, own)
+    return Matter(eps, earth + own, group, unit)
 
 
 @lru_cache(maxsize=64)
 def _grouped(matter: Matter, group: tuple[int, ...]) -> Matter:
     joint = np.array(group)
+    each = np.flatnonzero(matter.group == np.arange(len(group)))  # a conductor's tie is known once
 
     def total(ties: Array) -> Array:
         out = np.zeros(len(group))
-        np.add.at(out, joint, ties)
+        np.add.at(out, joint[each], ties[each])
         return out[joint]
 
     local = None if matter.local is None else total(matter.local)

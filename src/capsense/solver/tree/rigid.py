@@ -67,10 +67,12 @@ BODY = np.dtype(
         ("sizes", np.float64, 3),  # of a primitive, as its ``params``
         ("triangles", np.int64), ("boxes", np.int64),  # of a mesh: addresses of its tree
         ("triangle_count", np.int64), ("levels", np.int64),
+        ("capacitance", np.float64),  # of the shape in free space [m]
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("sunk", np.float64),  # how far below that it stands in a cover [m], once it is pressed out
         ("neutral", np.int64),  # whether it carries no net charge
+        ("free", np.int64),  # whether it is a conductor that is not at ground
         ("group", np.int64),  # bodies that touch are one conductor, named by its first body
         # energy of a group's net charge beyond that of its field [1/m]
         ("ground_elastance", np.float64),
@@ -153,6 +155,7 @@ class RigidShape(Frozen):
         record = np.zeros(1, BODY)[0]
         record["n"] = record["n_tabulated"] = len(self.panels)
         record["n_panel_clusters"] = 2 * len(self.panels) - 1
+        record["capacitance"] = self.capacitance
         record["potential_coefficients"], record["own"] = (
             self.potential_coefficients.ctypes.data,
             self.own.ctypes.data,
