@@ -221,9 +221,10 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         return np.clip(out[:, : len(points)].T, 0.0, 1.0)
 
     gap, has_face = pack_gap(green.gap, green.clearance, design), math.isfinite(cover_of(design))
+    inner, fade = fading(room, np.asarray(green.box, float), extent)
     space = Space(
         has_face, gap.face, gap.curvature, room, extent,
-        *fading(room, np.asarray(green.box, float), extent), gap.validity, gap.soft.limit,
+        inner, fade, gap.validity, gap.soft.limit,
     )  # fmt: skip
     return Green(
         (near, middle, far),

@@ -20,7 +20,7 @@ from capsense.scene.shapes import Shape
 from capsense.solver.bodies.outline import CHANGING, write_triangles
 from capsense.solver.gap.gap_kernels import REACH
 from capsense.solver.gap.touch import Pressed
-from capsense.solver.tree.dynamic_surface import DynamicBody, Layer
+from capsense.solver.tree.dynamic_surface import DipoleLayer, DynamicBody
 from capsense.solver.tree.matter import Matter
 from capsense.solver.tree.near_triangles import Face, near_triangles
 from capsense.solver.tree.rigid import BODY, RigidShape
@@ -109,13 +109,13 @@ class BodyTemplate:
 
 def layer_of(
     found: tuple[RigidShape | DynamicBody, float], conducting: bool
-) -> list[tuple[Layer, float]]:
+) -> list[tuple[DipoleLayer, float]]:
     """The dipoles that go with the charges of a thin sheet of triangles, if it is one."""
     body, size = found
     if conducting or not isinstance(body, DynamicBody) or body.sheet == 0.0:
         return []
     known = body.pieces is not None and body.pieces.normals is not None
-    return [(Layer(body), size)] if known else []
+    return [(DipoleLayer(body), size)] if known else []
 
 
 def make_template(

@@ -335,7 +335,7 @@ class DynamicBody:
         return sum(a.nbytes for a in held if isinstance(a, np.ndarray))
 
 
-class Layer(DynamicBody):
+class DipoleLayer(DynamicBody):
     """The dipoles across a thin sheet of a dielectric, on the clusters of its charges.
 
     A charge function is an even layer of charge on the front of its cluster, and the opposite one
