@@ -18,6 +18,7 @@ import flexible  # noqa: E402
 ROWS = json.loads((ROOT / "tests" / "data" / "flexible.json").read_text(encoding="utf-8"))
 KNOWN = {
     "5 cloth, wet cloth, dielectric, six_patch": 0.17,
+    "8 cloth, wet cloth, dielectric, patch": 0.16,
     "12 cable, copper, grounded, six_patch": 0.16,
     "15 cable, polyester, dielectric, six_patch": 0.15,
     "16 soft, foam, dielectric, six_patch": 0.18,
