@@ -129,11 +129,8 @@ def main() -> None:
             name = tie if isinstance(tie, str) else f"{1e12 * tie:g} pF"
             jump, slope = judge(sim, group, tie)
             worst[preset, name].append((jump, slope))
-            print(
-                f"{seed:4d} {design:14s} {preset:8s} {name:8s} jump {jump:.1e}  "
-                f"a mm {100 * slope:.3f} %",
-                flush=True,
-            )
+            print(f"{seed:4d} {design:14s} {preset:8s} {name:8s} jump {jump:.1e}  "
+                  f"a mm {100 * slope:.3f} %", flush=True)  # fmt: skip
     print(f"\n{'preset':8s} {'tie':8s} {'scenes':>6s} {'jump':>8s} {'a mm':>12s} {'worst':>8s}")
     for (preset, name), values in worst.items():
         jumps, slopes = np.array(values).T

@@ -145,3 +145,23 @@ def test_a_conductor_has_one_grounding() -> None:
         ])  # fmt: skip
     with pytest.raises(cs.SceneError, match="conductor is ''; give a non-empty string"):
         cs.Body(cs.Sphere(0.02), conductor="")
+
+
+@pytest.mark.parametrize("grounding", ["floating", 5e-12, 100e-12])
+def test_jacobians_follow_parts_that_come_in(simulators, grounding) -> None:
+    """Differential: central differences, of a trunk at the wall."""
+    sim = simulators("six_patch_bare", preset="fine")
+    for x in (0.345, 0.36, 0.37):
+
+        def bodies(dx: float, x: float = x) -> cs.Scene:
+            shapes = (cs.Capsule(0.04, 0.25), 0.02, 0.08), (cs.Box((0.3, 0.25, 0.3)), x + dx, 0.25)
+            return cs.Scene([
+                cs.Body(shape, cs.Pose((at, 0.01, z), ALONG), "human", grounding, conductor="p")
+                for shape, at, z in shapes
+            ])  # fmt: skip
+
+        found = sim.step(bodies(0.0), jacobian=True).jacobian[1, ..., 0]
+        low, high = (sim.step(bodies(s)).delta for s in (-2e-4, 2e-4))
+        wanted = (high - low) / 4e-4
+        whole = np.abs(sim.step(bodies(0.0)).delta).max()
+        assert np.abs(found - wanted).max() < 0.03 * np.abs(wanted).max() + 0.05 * whole

@@ -88,7 +88,7 @@ def test_touching_bodies_are_one(simulators, overlap, within, grounding):
 
 @pytest.mark.parametrize("jacobian", [False, True])
 def test_what_touches_outside_of_the_domain_counts(simulators, jacobian):
-    """Invariant: an arm on 1 pF that goes on outside as one on 3 pF is on 4 pF."""
+    """Invariant: an arm on 10 pF that goes on outside as one on 30 pF is on 40 pF."""
     sim = simulators("six_patch_bare")
     assert sim.design.domain.upper[0] < 0.29
     lying = (0.0, 2**-0.5, 0.0, 2**-0.5)
@@ -97,13 +97,13 @@ def test_what_touches_outside_of_the_domain_counts(simulators, jacobian):
         pose = cs.Pose((middle, 0.0, 0.08), lying)
         return cs.Body(cs.Capsule(0.03, 0.3), pose, grounding=grounding)
 
-    outer = arm(0.42, 3e-12)
-    both = sim.step(cs.Scene([outer, arm(0.1, 1e-12)]), jacobian=jacobian)
-    alone = sim.step(cs.Scene([arm(0.1, 4e-12)]), jacobian=jacobian)
+    outer = arm(0.42, 30e-12)
+    both = sim.step(cs.Scene([outer, arm(0.1, 10e-12)]), jacobian=jacobian)
+    alone = sim.step(cs.Scene([arm(0.1, 40e-12)]), jacobian=jacobian)
     np.testing.assert_allclose(both.delta, alone.delta, rtol=1e-9)
     if jacobian:
         np.testing.assert_allclose(both.jacobian[1], alone.jacobian[0], rtol=1e-9, atol=1e-25)
-    apart = sim.step(cs.Scene([arm(0.1, 1e-12)]))
+    apart = sim.step(cs.Scene([arm(0.1, 10e-12)]))
     assert np.abs(apart.delta - alone.delta).max() > 0.05 * np.abs(alone.delta).max()
 
 

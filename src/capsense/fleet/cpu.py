@@ -23,6 +23,7 @@ from capsense.solver.gap.gap_kernels import near_bodies
 from capsense.solver.gap.touch_kernels import Foundation, press
 from capsense.solver.surface_solver import SurfaceSolver
 from capsense.solver.system.lossy import solve_lossy
+from capsense.solver.system.network_kernels import tie_what_is_outside
 from capsense.solver.system.step import slopes_of, solve
 from capsense.solver.tree.matter import FLOATING_PENALTY
 from capsense.solver.tree.rigid import BODY, HALF_SPACE
@@ -90,15 +91,7 @@ def _step_rows(
     turn = np.empty((3, 3))
     for e in range(start, stop):
         for s in range(sensors):
-            count = _seen(
-                bodies,
-                poses,
-                e,
-                s,
-                (green.active_bounds, WALL_EDGE * green.extent),
-                room,
-                place,
-            )
+            count = _seen(bodies, poses, e, s, green, room, place)
             for c in range(count):
                 b = place[c]
                 if (
@@ -138,31 +131,47 @@ def _step_rows(
 
 @compiled
 def _seen(
-    bodies: Bodies, poses: Poses, e: int, s: int, sight: tuple[Array, float], records: Any,
-    place: Any,
-) -> int:  # fmt: skip
+    bodies: Bodies, poses: Poses, e: int, s: int, green: Green, records: Any, place: Any
+) -> int:
     """Fill the records and places of what a sensor sees, (b,) each.
 
-    ``sight`` are the corners of where it sees, and how far beyond them bodies fade out [m].
+    So are those out of its sight that are one conductor with what it sees and not at ground.
 
     Returns:
-        How many it sees.
+        How many there are.
     """
     turns = np.empty((3, 3)), np.empty((3, 3))
+    sight = green.active_bounds, WALL_EDGE * green.extent
     _matrix(poses.sensors[e, s], turns[0])
-    count = 0
-    for b in range(bodies.choice.shape[1]):
+    count, places = 0, bodies.choice.shape[1]
+    there = np.zeros(places, np.bool_)
+    for b in range(places):
         if bodies.choice[e, b] >= 0 and not bodies.hidden[s, b]:
             record = records[count : count + 1]
-            if _placed(bodies, e, b, poses, s, turns, sight, record):
+            there[b] = _placed(bodies, e, b, poses, s, turns, sight, record)
+            if there[b]:
                 place[count] = b
                 count += 1
+    for b in range(places):
+        if there[b] or bodies.choice[e, b] < 0 or bodies.hidden[s, b]:
+            continue
+        free = bodies.neutral[e, b] != 0 or bodies.ground_elastance[e, b].real > 0.0
+        if not free or bodies.inverse_susceptibility[e, b] != 0.0:
+            continue
+        joined = False
+        for c in range(places):
+            joined = joined or (there[c] and bodies.group[c] == bodies.group[b])
+        if joined:
+            _placed(bodies, e, b, poses, s, turns, (sight[0], np.inf), records[count : count + 1])
+            place[count] = b
+            count += 1
     for c in range(count):
         _connect(bodies, e, records[:count], place, c)
     for c in range(count):
         conducts = records[c].inverse_susceptibility == 0.0
         tied = records[c].neutral != 0 or records[c].ground_elastance > 0.0
         records[c].free = 1 if conducts and tied else 0
+    tie_what_is_outside(records[:count], green.space)
     return count
 
 
@@ -357,13 +366,12 @@ class CpuCore:
         solver, table = self._solver, self._table.bodies
         where = _in_units(solver, bodies, sensors, self._table.forces)
         green = solver.green
-        sight = green.active_bounds, WALL_EDGE * green.extent
         records = np.empty(table.choice.shape[1], BODY)
         place = np.empty(len(records), np.int64)
         out = np.zeros((len(rows), sensors.shape[1]), np.bool_)
         for k, s in np.ndindex(out.shape):
             e = int(rows[k])
-            some = records[: _seen(table, where, e, s, sight, records, place)].copy()
+            some = records[: _seen(table, where, e, s, green, records, place)].copy()
             at = place[: len(some)]
             soft, ties = table.inverse_susceptibility[e, at], table.ground_elastance[e, at]
             some["inverse_susceptibility"] = 0.0
@@ -387,15 +395,7 @@ class CpuCore:
         loss = np.zeros_like(found.delta)
         records, place = np.empty(table.places, BODY), np.empty(table.places, np.int64)
         for e, s in np.argwhere(found.lossy).tolist():
-            count = _seen(
-                bodies,
-                where,
-                e,
-                s,
-                (solver.green.active_bounds, WALL_EDGE * solver.green.extent),
-                records,
-                place,
-            )
+            count = _seen(bodies, where, e, s, solver.green, records, place)
             at = place[:count]
             if len(solver.cover.strain):
                 unused = np.empty((2, found.force.shape[-1]))

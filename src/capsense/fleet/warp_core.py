@@ -331,7 +331,7 @@ class WarpCore:
         """What is near the design, and what the gap law adds for it."""
         near = self.outlines, self.gap
         (chunks, _, views), launch = self.near.depth.shape, self.launch
-        launch(warp_near.connect, views, self.places, self.cut, self.green.terminals)
+        launch(warp_near.connect, views, self.shapes, self.places, self.green, self.cut)
         if chunks:
             launch(warp_near.find_near, views, *near, self.cut, self.near)
             launch(warp_near.press, (views, chunks), *near, self.near)

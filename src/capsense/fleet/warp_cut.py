@@ -49,6 +49,7 @@ class Shapes:
     block: wp.array(dtype=wp.int64)  # where its energies begin …
     inside: wp.array(dtype=wp.int64)  # … and its impedances, if it is a dielectric's
     radius: wp.array(dtype=wp.float32)
+    capacitance: wp.array(dtype=wp.float32)  # in free space
     children: wp.array2d(dtype=wp.int32)  # parts of a cluster, from 0 within the shape; -1 for none
     function: wp.array(dtype=wp.int32)
     charge: wp.array(dtype=wp.float32)

@@ -15,10 +15,11 @@ import warp as wp
 
 from capsense.field.green_kernels import Gap, Green, no_gap
 from capsense.field.soft import BODY
-from capsense.fleet.warp_cut import Places, WarpActiveTree
+from capsense.fleet.warp_cut import Places, Response, Shapes, WarpActiveTree, off_walls, smooth
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import farthest_point, middle_height, nearest, reach_down
 from capsense.solver.gap.gap_kernels import EXACT, WAYS
+from capsense.solver.system.network_kernels import COARSE
 from capsense.solver.tree.matter import FLOATING_PENALTY
 
 wp.set_module_options({"enable_backward": False})
@@ -28,6 +29,7 @@ _WAYS, _EXACT, _FLOATING_PENALTY = (
     wp.constant(EXACT),
     wp.constant(FLOATING_PENALTY),
 )
+_COARSE = wp.constant(COARSE)
 _BLOCKS = 3
 """About so many blocks are a chunk."""
 
@@ -127,13 +129,29 @@ def pack_gap(green: Green, gap: Gap, slots: int, device: Any) -> GapLaw:
     return out
 
 
+@wp.func
+def outside_capacitance(shapes: Shapes, places: Places, green: Response, at: wp.transform,
+                        e: int, b: int):  # fmt: skip
+    """What is out of reach of a body has in free space, as ``network_kernels``."""
+    u = places.choice[e, b]
+    first = shapes.first[u]
+    scale = places.scale[e, b]
+    outside = float(0.0)
+    for k in range(wp.min(_COARSE, 2 * shapes.functions[u] - 1)):
+        part = shapes.children[first + k, 0]
+        if part < 0 or part >= _COARSE - 1:  # else its parts stand for it
+            off = off_walls(wp.transform_point(at, scale * shapes.center[first + k]), 1, green)
+            outside += shapes.charge[first + k] * smooth(wp.length(off))
+    return scale * shapes.capacitance[u] * outside / shapes.charge[first]
+
+
 @wp.kernel
-def connect(places: Places, cut: WarpActiveTree, terminals: int):
+def connect(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
     """What ties the bodies of a view to ground; places that are joined are one conductor.
 
-    Those that are out of sight count for the tie. The leader of those in sight has the function of
-    the net charge. That of each other member is its own equilibrium charge less the leader's,
-    which is neutral.
+    Those that are out of sight count for the tie, which is at least what is out of reach has in
+    free space. The leader of those in sight has the function of the net charge. That of each other
+    member is its own equilibrium charge less the leader's, which is neutral.
     """
     v = wp.tid()
     e = v // places.hidden.shape[0]
@@ -143,6 +161,7 @@ def connect(places: Places, cut: WarpActiveTree, terminals: int):
         leader = int(b)
         tie = places.ground_elastance[e, b]
         neutral = places.neutral[e, b]
+        cut.free[b, v] = 0
         if cut.node[o, v] >= 0:
             others = int(0)
             grounded = int(0)
@@ -161,16 +180,25 @@ def connect(places: Places, cut: WarpActiveTree, terminals: int):
             if others == 1:
                 neutral = wp.where(grounded == 0 and ground == 0.0, 1, 0)
                 tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
+            conducts = places.inverse_susceptibility[e, b] == wp.vec2()
+            if conducts and (neutral != 0 or tie[0] > 0.0):
+                cut.free[b, v] = 1
+                outside = float(0.0)
+                for c in range(places.group.shape[0]):
+                    joined = places.group[c] == places.group[b] and places.choice[e, c] >= 0
+                    if joined and places.hidden[v % places.hidden.shape[0], c] == 0:
+                        outside += outside_capacitance(shapes, places, green, cut.pose[c, v], e, c)
+                if outside * _FLOATING_PENALTY > 1.0 and (neutral != 0 or tie[0] * outside > 1.0):
+                    neutral = int(0)
+                    tie = wp.vec2(1.0 / outside, 0.0)
             cut.number[o, v] = wp.where(leader == b and neutral != 0, -1, 0)
             if tie[1] != 0.0 or places.inverse_susceptibility[e, b][1] != 0.0:
                 lossy = 1
         cut.leader[b, v] = leader
-        conducts = places.inverse_susceptibility[e, b] == wp.vec2()
-        cut.free[b, v] = wp.where(conducts and (neutral != 0 or tie[0] > 0.0), 1, 0)
         cut.ground_elastance[b, v] = tie
         cut.slot[b, v] = -1
     cut.lossy[v] = lossy
-    cut.columns[v] = terminals
+    cut.columns[v] = green.terminals
 
 
 @wp.kernel

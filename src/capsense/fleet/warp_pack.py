@@ -87,6 +87,7 @@ def pack_shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any
         ends = np.cumsum([0, *map(len, parts)])
         setattr(out, name, array(ends[:-1], wp.int64))
     out.radius = array(bodies.radius, wp.float32)
+    out.capacitance = array(np.array([shape.capacitance for shape in shapes]), wp.float32)
     for name, kind in (
         ("children", wp.int32), ("function", wp.int32), ("charge", wp.float32), ("center", wp.vec3),
         ("points", wp.vec3), ("extent", wp.float32), ("softening_length", wp.float32),

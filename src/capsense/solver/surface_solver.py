@@ -358,23 +358,22 @@ class SurfaceSolver:
             self._contact.reset()
 
     def look(self, scene: Scene) -> View:
-        """Find the bodies of a scene that reach into the domain."""
-        packed = scene.pack()
-        met = self._with_conductors(scene, overlapping(packed.bounds, *(self.length * self._sight)))
-        matter = self.matter_of(list(scene)).repeated(met.tolist())
-        return View(scene, packed, met, matter)
+        """Find the bodies of a scene that reach into the domain, and what they are made of.
 
-    @staticmethod
-    def _with_conductors(scene: Scene, met: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Bodies that are met, and what else there is of conductors that are not at ground."""
-        names = {scene[k].conductor for k in met.tolist()} - {None}
-        if not names:
-            return met
-        more = [
-            k for k, body in enumerate(scene)
-            if body.conductor in names and body.grounding != "grounded"
-        ]  # fmt: skip
-        return np.union1d(met, np.array(more, met.dtype))
+        Of conductors that are not at ground, and of those that touch these, all parts count, also
+        those outside of the domain: a person's other limbs.
+        """
+        packed = scene.pack()
+        met = overlapping(packed.bounds, *(self.length * self._sight))
+        matter = self.matter_of(list(scene))
+        if not (matter.some_free and len(met)):
+            return View(scene, packed, met, matter.repeated(met.tolist()))
+        used = np.union1d(met, np.flatnonzero(matter.free))
+        joined = matter.repeated(used.tolist()).joined(scene, packed, used)
+        seen = np.isin(used, met)
+        seen |= joined.free & np.isin(joined.group, joined.group[seen])
+        places = np.flatnonzero(seen)
+        return View(scene, packed, used[places], joined.repeated(places.tolist()))
 
     def matter_of(self, bodies: Sequence[Body]) -> Matter:
         """What bodies are made of, with lengths as kernels take them."""
@@ -484,7 +483,7 @@ class SurfaceSolver:
 
     def pack(self, view: View, time: float | None = None) -> PackedBodies:
         """Lay out the bodies that reach into the domain, pressed into the cover if there is one."""
-        matter, packed = self._joined(view), view.packed
+        matter, packed = view.matter, view.packed
         bodies = [packed.shapes[k] for k in view.met.tolist()]
         offsets: list[tuple[int, Array]] = []
         key = matter, *bodies
@@ -536,19 +535,6 @@ class SurfaceSolver:
             laid = make_template(matter, places, found)
         whole = [body.measured_in(self.length) for body in bodies]
         return replace(laid, everywhere=same(solved, whole)), offsets
-
-    def _joined(self, view: View) -> Matter:
-        """What bodies are made of, with conductors that touch as one.
-
-        Those that are not at ground count outside of the domain too: a person's other limbs.
-        """
-        if not view.matter.some_free:
-            return view.matter
-        whole = self.matter_of(list(view.scene))
-        used = np.union1d(view.met, np.flatnonzero(whole.free))
-        places = np.searchsorted(used, view.met)
-        joined = whole.repeated(used.tolist()).joined(view.scene, view.packed, used)
-        return joined.repeated(places.tolist())
 
     def _parts(self, view: View, place: int) -> tuple[Sequence[Shape], float, Array | None]:
         """Parts of a body to be solved for.

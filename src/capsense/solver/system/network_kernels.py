@@ -15,7 +15,7 @@ from capsense.field.face_kernels import off_walls, smooth
 from capsense.solver.system.system_kernels import System
 from capsense.solver.tree.matter import FLOATING_PENALTY
 
-_COARSE = 31
+COARSE = 31
 """So many clusters, the coarsest ones, tell how far a body is out of reach."""
 
 
@@ -31,8 +31,8 @@ def outside_capacitance(body, space):
         integers(body.children), doubles(body.charge), doubles(body.center),
     )  # fmt: skip
     outside, r, p, s = 0.0, body.rotation, body.position, body.scale
-    for k in range(min(_COARSE, 2 * body.n - 1)):
-        if 0 <= children[2 * k] < _COARSE - 1:  # its parts stand for it
+    for k in range(min(COARSE, 2 * body.n - 1)):
+        if 0 <= children[2 * k] < COARSE - 1:  # its parts stand for it
             continue
         x, y, z = center[3 * k], center[3 * k + 1], center[3 * k + 2]
         off, _ = off_walls(
@@ -65,6 +65,16 @@ def tie_what_is_outside(bodies, space):
             body = bodies[b]
             if body.neutral != 0 or body.ground_elastance * found[b] > 1.0:
                 body.neutral, body.ground_elastance = 0, 1.0 / found[b]
+
+
+@kernel
+def is_tied_by_what_is_outside(bodies, b, space):
+    """Whether the conductor of a body has the tie that :func:`tie_what_is_outside` gives it."""
+    total = 0.0
+    for c in range(bodies.shape[0]):
+        if bodies[c].group == bodies[b].group:
+            total += outside_capacitance(bodies[c], space)
+    return total > 0.0 and abs(bodies[b].ground_elastance * total - 1.0) < 1e-9
 
 
 @compiled

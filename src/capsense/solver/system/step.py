@@ -49,7 +49,9 @@ from capsense.solver.system.network_kernels import (
     as_nodes,
     coarse_of,
     congruent,
+    is_tied_by_what_is_outside,
     mixed,
+    outside_capacitance,
     potentials_of,
     with_nodes,
 )
@@ -307,6 +309,42 @@ def solve_lifted(
 
 
 @compiled
+def _add_outside_slopes(
+    solution: Solution, bodies: NDArray[np.void], green: Green, out: NDArray[Any]
+) -> None:
+    """Add how conductors not at ground are tied to it as their parts come into reach or leave.
+
+    A capacitance C to ground of a conductor at the potential V_i changes ΔC_ij by V_i V_j dC.
+    """
+    m, moved = green.terminals, bodies.copy()
+    potential = np.empty(m)
+    for b in range(bodies.shape[0]):
+        body = bodies[b]
+        if body.free == 0 or not is_tied_by_what_is_outside(bodies, b, green.space):
+            continue
+        if solution.node[b] >= 0:
+            for i in range(m):
+                potential[i] = solution.weights[solution.node[b], i]
+        else:
+            potential[:] = 0.0
+            for j in range(solution.owner.shape[0]):
+                if bodies[solution.owner[j]].group == body.group:
+                    for i in range(m):
+                        potential[i] += body.ground_elastance * solution.charge[j, i]
+        arm = max(extent_of_body(body), green.gap.validity)
+        for r in range(6):
+            step = DIFFERENCE * green.gap.validity / (1.0 if r < 3 else arm)
+            move(moved[b], body, r, step)
+            change = outside_capacitance(moved[b], green.space)
+            move(moved[b], body, r, -step)
+            change -= outside_capacitance(moved[b], green.space)
+            for i in range(m):
+                for j in range(m):
+                    out[b, i, j, r] += 0.5 * change / step * potential[i] * potential[j]
+        move(moved[b], body, 0, 0.0)
+
+
+@compiled
 def slopes_of(
     solution: Solution, bodies: NDArray[np.void], green: Green, threshold: float, width: float
 ) -> NDArray[Any]:
@@ -333,6 +371,7 @@ def slopes_of(
                 for j in range(m):
                     out[b, i, j, r] = (after[i, j] - before[i, j]) / (2.0 * delta)
         move(moved[b], bodies[b], 0, 0.0)
+    _add_outside_slopes(solution, bodies, green, out)
     return out
 
 
