@@ -4,7 +4,8 @@ Sends a moving dome as 64 × 64 depth frames, one after another, over loopback t
 process of its own, and waits for each reading. Times are of this machine, as found; what the server
 says its step took is taken from each round trip, and the rest is what the protocol costs. What the
 processor spent on the server is little changed by other programs, and bounds what it can do on a
-machine of its own. With ``mcs`` and ``mono`` there, the Unity package is measured as well.
+machine of its own. With ``mcs`` and ``mono`` there, the Unity package is measured as well. Tracked
+hands are those of ``examples/hands/reach.npz``, in place of images.
 ``--runs`` measures all in turn, several times.
 """
 
@@ -27,6 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from capsense.bench import moving_depth
+from capsense.humans import HandRecording
 from capsense.server import ReadingMessage
 from capsense.server.client import Client
 
@@ -101,7 +103,7 @@ def python_stream(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def unity_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The same by the Unity package under mono."""
-    sources = [*(ROOT / "tests/e2e/unity").glob("*.cs"), *(ROOT / "unity/Runtime").glob("*.cs")]
+    sources = [*(ROOT / "tests/e2e/unity").glob("*.cs"), *(ROOT / "unity/Runtime").rglob("*.cs")]
     sources += (ROOT / "unity/Samples~").rglob("*.cs")
     with tempfile.TemporaryDirectory() as folder:
         program = f"{folder}/driver.exe"
@@ -122,12 +124,31 @@ def two_clients(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(taken), np.concatenate(solve)
 
 
+def tracked_hands(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frames of the tracked hand of the example; the server has its model and filters them."""
+    recording = HandRecording.load(ROOT / "examples" / "hands" / "reach.npz")
+    taken, solve = np.empty(count), np.empty(count)
+    with Client(url) as client:
+        sensor = client.open(material="human", grounding=100e-12)
+        length = recording.time[-1] + 1 / 60
+        for k in range(count):
+            lap, frame = divmod(k, len(recording))
+            joints = {recording.side: recording.joints[frame]}
+            now = lap * length + recording.time[frame]
+            start = time.perf_counter()
+            solve[k] = sensor.step_hands(joints, now, convention=recording.convention).wall_time
+            taken[k] = time.perf_counter() - start
+    first = int(SKIPPED * count)
+    return taken[first:], solve[first:]
+
+
 CLIENTS = {
     "Python": (python_client, 1),
     "Python, streaming": (python_stream, 1),
     "Python, two at once": (two_clients, 2),
     "Unity package, mono": (unity_client, 1),
     "Python, empty frames": (nothing_in_view, 1),
+    "Python, tracked hands": (tracked_hands, 1),
 }
 COLUMNS = ("a second", "median", "p95", "p99", "solve", "protocol", "server")
 

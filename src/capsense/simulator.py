@@ -47,6 +47,9 @@ _DOUBTFUL, _SEEN = 0.1, 1e-4
 """Estimated errors are warned of above this part of a change, and of the largest capacitance."""
 
 
+ONCE = "Further warnings are suppressed; reading.stats.solver_error has the estimate"
+
+
 class Doubt(NamedTuple):
     """That the estimated error of a reading is large."""
 
@@ -363,17 +366,36 @@ class Simulator:
         self, scene: Scene, own: Array, error: float, reason: Callable[[], str]
     ) -> None:
         """Warn once where an estimated error is a large part of the change of an electrode [F]."""
-        own = own[: self._terminals.electrodes]
+        doubt = self._doubt(scene, own[: self._terminals.electrodes], error, reason)
+        if doubt is None:
+            return
+        self._doubtful, self.doubt = math.inf, doubt
+        if not self.in_skin:
+            warnings.warn(f"{doubt.text}. {ONCE}", stacklevel=4)
+
+    def _doubt(
+        self, scene: Scene, own: Array, error: float, reason: Callable[[], str]
+    ) -> Doubt | None:
+        """What is said of an estimated error, if it is a large part of electrodes' changes [F]."""
         most = int(own.argmax())
         if error <= _DOUBTFUL * own[most]:
-            return
-        self._doubtful = math.inf
+            return None
         electrode = self.design.electrodes[most]
         share = error / max(own[most], 1e-300)
         surface = electrode.name, electrode.surface.triangles
-        self.doubt = Doubt(share, doubt_of(scene, surface, share, reason()))
-        if not self.in_skin:
-            warnings.warn(self.doubt.text, stacklevel=4)
+        return Doubt(share, doubt_of(scene, surface, share, reason()))
+
+    def doubt_about(self, scene: Scene, reading: Reading) -> Doubt | None:
+        """What :meth:`step` would warn of, had it given a reading of a scene as its first one."""
+        error = reading.stats.solver_error
+        if error <= _SEEN * float(self.baseline.max()):
+            return None
+        return self._doubt(scene, np.abs(np.diag(reading.delta)), error, str)
+
+    @property
+    def touch(self) -> float:
+        """What is nearer to an electrode than this [m] touches it."""
+        return self._solver.touch
 
     def _reading(
         self,

@@ -12,6 +12,7 @@ import pytest
 from approximate import approx
 
 import capsense as cs
+from capsense.humans import HandRecording
 from capsense.scenario import play
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -78,3 +79,45 @@ def test_touch_approach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert (tmp_path / "touch_approach.png").stat().st_size > 10_000
     code = record.codes.of("press").code
     assert code.max() - np.median(code[:5]) > 1e6
+
+
+def test_hand_over_six_patch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracked hand is sensed while it is there, and leaves without a jump when it is lost.
+
+    Filtered fingertips are nearer to the truth than what the tracker reports, at rest.
+    """
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    monkeypatch.syspath_prepend(str(EXAMPLES / "hands"))
+    module, maker = importlib.import_module("hand_over_six_patch"), importlib.import_module(
+        "make_reach"
+    )  # fmt: skip
+    recording = HandRecording.load(module.RECORDING)
+    np.testing.assert_allclose(maker.make().joints, recording.joints, atol=1.01 * maker.BEST)
+    assert module.RECORDING.stat().st_size < 100_000
+    played = module.main(tmp_path)
+    assert (tmp_path / "hand_over_six_patch.png").stat().st_size > 10_000
+    status = np.array([s.status for s in played.samples])
+    changes = np.flatnonzero(status[1:] != status[:-1]) + 1
+    assert status[[0, *changes]].tolist() == [
+        "tracked", "held", "leaving", "absent", "returning", "tracked",
+    ]  # fmt: skip
+    time, own = recording.time, played.delta
+    assert not own[status == "absent"].any()
+    pressed, fist = (time > 2.5) & (time < 2.9), (time > 5.0) & (time < 5.3)
+    assert np.argmax(own[pressed].mean(axis=0)) == 1  # the middle finger is over E2
+    assert np.argmax(own[fist].mean(axis=0)) == 4  # the thumb is over E5
+    assert own[pressed].mean(axis=0).min() > 20 * own[time < 0.3].max()
+    held = own[status == "held"]
+    assert np.ptp(held[1:], axis=0).max() < 1e-20
+    for edge in (np.flatnonzero(status == "leaving")[-1], changes[3]):  # out of sight by then
+        assert own[edge].max() < 0.01 * held.max()
+    still = ((time > 1.4) & (time < 1.8)) | pressed
+    truth = np.array([maker.HAND.landmarks(j) for j in maker.truth(time[still])])
+    shown = np.array([s.landmarks for s, ok in zip(played.samples, still, strict=True) if ok])
+    raw = played.raw[still]
+
+    def scatter(points: np.ndarray) -> float:  # but for the drift, which no filter can see
+        off = points - truth
+        return float(np.std(np.diff(off, axis=0)))
+
+    assert scatter(shown) < 0.5 * scatter(raw)

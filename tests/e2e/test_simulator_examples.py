@@ -99,6 +99,17 @@ def test_gripper(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     assert len(capsys.readouterr().out.splitlines()) == 1 + -(-len(rows) // 5)
 
 
+def test_people(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The picture is drawn; the more ground, the larger the change, near that of an earthed one."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    module = importlib.import_module("people")
+    module.figure().savefig(tmp_path / "people.png")
+    assert (tmp_path / "people.png").stat().st_size > 20_000
+    rows = sorted(module.readings(), key=lambda row: row[2])
+    assert [row[3] for row in rows] == sorted(row[3] for row in rows)
+    assert all(93 < row[4] < 100 for row in rows)
+
+
 @pytest.mark.parametrize("page", ["mujoco", "pybullet", "humans", "skins"])
 def test_pages_run(page: str) -> None:
     """The first snippet of a page runs as it stands and feels an arm."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,11 @@ class Stated:
         self.empty = self.reading(-1)
         self.green = None
         self.closed = False
+
+    def stage(self, server: Any) -> Any:
+        from capsense.viewer.scene_drawing import SceneDrawing
+
+        return SceneDrawing(server, self.design)
 
     def reading(self, k: int) -> cs.Reading:
         n = len(self.design.electrodes)

@@ -263,7 +263,7 @@ namespace CapSense
             Send(data, WebSocketMessageType.Binary);
         }
 
-        private void SendText(string text)
+        internal void SendText(string text)
         {
             Send(new ArraySegment<byte>(Encoding.UTF8.GetBytes(text)), WebSocketMessageType.Text);
         }

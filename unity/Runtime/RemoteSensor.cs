@@ -28,6 +28,14 @@ namespace CapSense
         /// <summary>Whether conductors are grounded; else they float.</summary>
         public bool Grounded = true;
 
+        /// <summary>Capacitance that ties the person to ground [F], in place of
+        /// <see cref="Grounded"/>; 0: not given.</summary>
+        public double PersonCapacitance;
+
+        /// <summary>Build and filter of tracked hands, in the words of the protocol; null: the
+        /// defaults.</summary>
+        public IDictionary<string, object> Hands;
+
         /// <summary>Thickness that is assumed along the view [m]; 0: to the end of the domain.</summary>
         public double Thickness;
 
@@ -45,6 +53,8 @@ namespace CapSense
                 ["material"] = Material,
                 ["grounding"] = Grounded ? "grounded" : "floating",
             };
+            if (PersonCapacitance > 0) open["grounding"] = PersonCapacitance;
+            if (Hands != null) open["hands"] = Hands;
             if (Design.Length > 0) open["design"] = Design;
             if (Thickness > 0) open["back"] = Thickness;
             return Json.Write(open);
@@ -98,7 +108,13 @@ namespace CapSense
         /// <summary>Send a frame as soon as the one before is answered; the newest wins.</summary>
         public void Submit(DepthFrame frame)
         {
-            Offer(new Order(frame, null));
+            Offer(new Order(frame, null, null));
+        }
+
+        /// <summary>Send tracked hands as soon as the frame before is answered; the newest wins.</summary>
+        public void Submit(HandFrame frame)
+        {
+            Offer(new Order(null, frame, null));
         }
 
         /// <summary>Send a frame, and wait for its reading.</summary>
@@ -106,8 +122,21 @@ namespace CapSense
         /// <exception cref="OperationCanceledException">A newer frame replaced this one.</exception>
         public Task<Reading> StepAsync(DepthFrame frame)
         {
+            return StepAsync(frame, null);
+        }
+
+        /// <summary>Send tracked hands, and wait for the reading.</summary>
+        /// <exception cref="CapSenseException">The server refused, or the connection was lost.</exception>
+        /// <exception cref="OperationCanceledException">A newer frame replaced this one.</exception>
+        public Task<Reading> StepAsync(HandFrame frame)
+        {
+            return StepAsync(null, frame);
+        }
+
+        private Task<Reading> StepAsync(DepthFrame frame, HandFrame hands)
+        {
             var answer = new TaskCompletionSource<Reading>(TaskCreationOptions.RunContinuationsAsynchronously);
-            Offer(new Order(frame, answer));
+            Offer(new Order(frame, hands, answer));
             return answer.Task;
         }
 
@@ -145,6 +174,11 @@ namespace CapSense
                 waiting = null;
                 order.Sequence = sequence++;
                 order.Sent = DateTime.UtcNow;
+            }
+            if (order.Hands != null)
+            {
+                client.SendText(order.Hands.ToMessage(Number, order.Sequence));
+                return;
             }
             // One frame is underway at a time, so the buffer is free.
             int size = Wire.SizeOf(order.Frame);
@@ -237,13 +271,15 @@ namespace CapSense
         private sealed class Order
         {
             internal readonly DepthFrame Frame;
+            internal readonly HandFrame Hands;
             internal readonly TaskCompletionSource<Reading> Answer;
             internal long Sequence;
             internal DateTime Sent;
 
-            internal Order(DepthFrame frame, TaskCompletionSource<Reading> answer)
+            internal Order(DepthFrame frame, HandFrame hands, TaskCompletionSource<Reading> answer)
             {
                 Frame = frame;
+                Hands = hands;
                 Answer = answer;
             }
         }

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from capsense._thread_pool import ForkSafeRLock
 from capsense._validate import suggest
 from capsense.adapters.contacts import Contact
+from capsense.adapters.findings import Findings
 from capsense.adapters.placement import FAR, blind, buried, far_off, felt, placement, turned_round
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
@@ -35,6 +36,9 @@ from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Simulator
 
 Array = NDArray[np.float64]
+
+_OUT = 1e-3
+"""A sensor has its link at its back where the middle of that is so far behind it [m]."""
 
 
 class AttachedSensor(ABC):
@@ -193,7 +197,7 @@ class AttachedSensor(ABC):
             SceneError: The simulator has not been stepped yet.
         """
 
-    def check(self) -> list[str]:
+    def check(self) -> Findings:
         """What is wrong with where the sensor sits and what it sees at the present state.
 
         Electrodes inside a body or touching one, or deep inside the link that carries them; a
@@ -201,7 +205,9 @@ class AttachedSensor(ABC):
         that are set wrongly.
 
         Returns:
-            A sentence for each finding, with its fix; none where all is well.
+            A list of sentences, each with its fix; none where all is well. ``.mounting`` has those
+            of where the sensor sits and of what ``attach`` was told, which stay; ``.scene`` those
+            of the present state. Printed, they are marked as such.
 
         Raises:
             SceneError: The simulator has not been stepped yet, or has diverged.
@@ -216,7 +222,7 @@ class AttachedSensor(ABC):
         except SceneError:  # which the first reading will raise, too
             return
         if found:
-            warnings.warn("sensor: " + ";\nand ".join(found), stacklevel=3)
+            warnings.warn(f"sensor: {found}", stacklevel=3)
 
     @property
     def _design(self) -> Design:
@@ -310,6 +316,10 @@ class WorldSource(ABC):
         """The frames of the robot that a frame belongs to."""
 
     @abstractmethod
+    def neighbours(self, frame: int) -> set[int]:
+        """The frames that are fixed to a frame, or that one joint of the robot moves against it."""
+
+    @abstractmethod
     def links(self) -> tuple[Array, Array]:
         """Origins [m] (f, 3) and quaternions (f, 4) of the moving frames, as they are now."""
 
@@ -355,20 +365,32 @@ class GeometrySensor(AttachedSensor):
         frames = self._now(None)
         return Pose(frames.sensor_position, frames.sensor_quaternion)
 
-    def check(self) -> list[str]:
+    def check(self) -> Findings:
         frames = self._now(None)
-        found, hidden = super().check(), buried(self._link(frames), self._design)
+        scene, simulator, carrier = self.scene(), self.simulator, self._carrier
+        near = {str(name) for name in self.world.names(self.source.neighbours(carrier))}
+        pressed: dict[str, float] = {}
+        for contact in self.source.contacts(carrier):
+            for name in map(str, self.world.names({contact.frame})):
+                pressed[name] = max(pressed.get(name, 0.0), -contact.gap)
+        found = felt(simulator, scene, placement(scene, simulator, near, pressed))
+        link = self._link(frames)
+        hidden = buried(link, self._design)
         if not blind(found):
-            return found + hidden
+            return Findings(found + hidden)
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
         own = self.world.names(self.source.robot(self._carrier))
         others = [str(b.name) for b in behind if b.name not in own]
+        middles = [b.pose.apply(b.shape.bounds().mean(axis=0))[2] for b in link]
+        outwards = bool(middles) and float(np.mean(middles)) < -_OUT
         if others:
-            return [turned_round(others), *hidden]
-        link = self._own_frame()
-        away = 0.0 if link is None else math.dist(frames.position[link], frames.sensor_position)
-        return ([far_off(away)] if away > FAR else found) + hidden
+            return Findings([turned_round(others, mounting=not outwards), *hidden])
+        own_frame = self._own_frame()
+        away = 0.0
+        if own_frame is not None:
+            away = math.dist(frames.position[own_frame], frames.sensor_position)
+        return Findings([*([far_off(away)] if away > FAR else found), *hidden])
 
     def _link(self, frames: Frames) -> Scene:
         """The bodies of the link that carries the sensor, where these are not seen."""

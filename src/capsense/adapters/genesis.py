@@ -80,6 +80,11 @@ class GenesisSensors(ParallelSensors):
         **options: Unpack[FleetOptions],
     ) -> None:
         rules, other = split_rules(options, FleetOptions)
+        if rules.shapes != "collision":
+            raise SceneError(
+                f"shapes is {rules.shapes!r}; of a scene of Genesis only what collides is seen: "
+                "leave shapes out"
+            )
         self._solver = scene.sim.rigid_solver
         worlds, device = max(int(scene.n_envs), 1), wp.get_device(str(gs.device))
         parts: list[WorldShape] = []

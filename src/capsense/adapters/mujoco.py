@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters import GeometrySensor, make_simulator, refuse_missing
+from capsense.adapters.findings import Finding, Findings
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
+from capsense.adapters.placement import markers
 from capsense.adapters.rules import AttachOptions, Image, Rules, check_perception, split_rules
-from capsense.adapters.skin import AttachedSkin, clear_of_neighbours, simulators_of
+from capsense.adapters.skin import AttachedSkin, Progress, clear_of_neighbours, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, listed, require_package
@@ -44,7 +46,7 @@ _TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
 _ONLY = {
     "geometry": (
         *("materials", "grounding", "exclude", "exclude_own"),
-        *("hull", "groups", "contact_forces"),
+        *("hull", "shapes", "groups", "contact_forces"),
     ),
     "depth_camera": ("camera", "back"),
 }
@@ -54,7 +56,8 @@ class MujocoSkinOptions(AttachOptions, total=False):
     """Keywords of :func:`attach_skin`."""
 
     groups: Collection[int] | None
-    """See only geoms of these groups (MuJoCo's 0 to 5); default all."""
+    """See only geoms of these groups (MuJoCo's 0 to 5); default all. Of these, ``shapes`` chooses
+    those that are seen."""
     contact_forces: bool
     """Whether the forces of MuJoCo's contacts press geoms onto the design's cover, True by default;
     of geoms without contact, the overlap with the cover counts."""
@@ -154,6 +157,7 @@ def attach_skin(
     *,
     readout: Readout | str | Path | None = None,
     threads: int | None = None,
+    progress: Progress | None = None,
     **options: Unpack[MujocoSkinOptions],
 ) -> AttachedSkin:
     """Attach a sensor to each of several sites; one ``read()`` reads them all, in parallel.
@@ -171,6 +175,8 @@ def attach_skin(
             :meth:`~capsense.adapters.skin.AttachedSkin.use_readout`; by default that of the
             simulator, if one is given.
         threads: How many threads read; by default as many as the process may use processors.
+        progress: Called with a stage's name and the fraction done. What is worked out is kept, also
+            if it is interrupted.
         options: As for :func:`attach`: those of :class:`MujocoSkinOptions`.
 
     Raises:
@@ -190,12 +196,12 @@ def attach_skin(
         raise TypeError(f"sites is {sites!r}; give a list of names, like [{sites!r}]")
     numbers = {site: find_site(model, site) for site in sites}
     source = ModelSource(model, data, rules, other.get("groups"))
-    simulators = simulators_of(sites, design)
+    simulators = simulators_of(sites, design, progress)
     sensors = {site: MujocoSensor(source, k, simulators[site]) for site, k in numbers.items()}
     for sensor in sensors.values():
         sensor.contact_forces = bool(other.get("contact_forces", True))
     skin = AttachedSkin(sensors, readout, threads)
-    skin.warn()
+    skin.warn(progress)
     return skin
 
 
@@ -217,16 +223,15 @@ class MujocoSensor(GeometrySensor):
     def _time(self) -> float:
         return float(self.data.time)
 
-    def check(self) -> list[str]:
+    def check(self) -> Findings:
         domain, sensor = self._design.domain, self.pose
         walls = domain.sight
         near = [
             g for g in range(self.model.ngeom) if _reaches(self.model, self.data, g, sensor, walls)
         ]
         own = self._carrier
-        return (
-            super().check() + _left_out(self.source, own, near) + _markers(self.source, own, near)
-        )
+        more = [*_left_out(self.source, own, near), *_markers(self.source, own, near)]
+        return Findings([*super().check(), *more])
 
     def _own_frame(self) -> int | None:
         return self._carrier if self.source.rules.exclude_own and self._carrier else None
@@ -240,7 +245,7 @@ class MujocoSensor(GeometrySensor):
         return Frames(position, quaternion, data.site_xpos[self._site], self._turn[_SCALAR_LAST])
 
 
-def _left_out(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
+def _left_out(source: ModelSource, own: int, near: Sequence[int]) -> list[Finding]:
     """The finding for geoms that ``groups`` leaves out, though they matter.
 
     These are in range, or on bodies that move, that are not seen otherwise and not of the sensor's
@@ -253,13 +258,16 @@ def _left_out(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
         near: Geoms that reach into the sensor's domain.
     """
     m = source.model
+    if source.groups is None:
+        return []
     taken = np.zeros(m.ngeom, dtype=bool)
     taken[source.geoms] = True
     missed = [
         g
-        for g in np.flatnonzero(~taken & (m.geom_bodyid != own)).tolist()
-        if not source.reader.excludes(g) and not _twins(source, g, taken).any()
-    ]
+        for g in np.flatnonzero(~np.isin(m.geom_group, [*source.groups])).tolist()
+        if m.geom_bodyid[g] != own
+        and not source.reader.excludes(g) and not _twins(source, g, taken).any()
+    ]  # fmt: skip
     seen, root = set(m.geom_bodyid[taken].tolist()), m.body_rootid
     free = (m.body_weldid > 0) | (m.body_mocapid[root] >= 0)
     moving = [
@@ -273,14 +281,15 @@ def _left_out(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
     groups = sorted(set(m.geom_group[source.geoms].tolist()))
     more = sorted({*groups, *m.geom_group[found].tolist()})
     what = "in the sensor's range" if set(found) & set(near) else "on bodies that move"
-    return [
+    text = (
         f"groups={groups} leaves out {listed([source.reader.name(g) for g in found], 4)}, {what}, "
         f"so that readings do not tell of {'it' if len(found) == 1 else 'them'}; give "
         f"groups={more}, or exclude them by name"
-    ]
+    )
+    return [Finding(text, "groups", mounting=True, severity=len(found))]
 
 
-def _markers(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
+def _markers(source: ModelSource, own: int, near: Sequence[int]) -> list[Finding]:
     """The finding for geoms in range that look like markers: see-through, and nothing hits them."""
     m = source.model
     collide = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
@@ -290,17 +299,12 @@ def _markers(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
         g
         for g in source.geoms
         if g in near and clear[g] and not collide[g] and m.geom_bodyid[g] != own
-        and not source.reader.excludes(g) and not _twins(source, g, collide).any()
+        and not source.reader.excludes(g)
     ]  # fmt: skip
-    if not found:
-        return []
     names = [source.reader.name(g) for g in found]
     bodies = list(dict.fromkeys(name.partition("/")[0] for name in names))
     exclude = names if "world" in bodies else bodies
-    return [
-        f"{listed(names, 4)} can be seen through and collide with nothing, as markers do, but are "
-        f"read as bodies; leave out what is none with exclude={exclude[:6]}"
-    ]
+    return markers(names, exclude)
 
 
 def _twins(source: ModelSource, geom: int, among: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters import DepthSensor, refuse_missing
+from capsense.adapters.findings import Finding, Findings
 from capsense.adapters.rules import Rules
 from capsense.errors import SceneError
 from capsense.scene import Pose
@@ -80,10 +81,10 @@ class MujocoDepthSensor(DepthSensor):
             grounding=self._grounding, back=self._back,
         )  # fmt: skip
 
-    def check(self) -> list[str]:
+    def check(self) -> Findings:
         camera, size = self._depth_camera, self._design.domain.size
         name, far = self.model.camera(camera.number).name, self._camera.far
-        found = []
+        found: list[str] = []
         if camera.height > 4 * max(size[:2]):
             found.append(
                 f"camera {name!r} shows {camera.height:g} m; give it the height of its image in "
@@ -104,7 +105,9 @@ class MujocoDepthSensor(DepthSensor):
                 f"camera {name!r} does not look along the sensor's z; its frame is the site's, "
                 'turned half round about x (euler="180 0 0")'
             )
-        return found or super().check()
+        if not found:
+            return super().check()
+        return Findings(Finding(text, "camera", mounting=True) for text in found)
 
     def _time(self) -> float:
         return float(self.data.time)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -35,6 +34,8 @@ _SCALAR_LAST = [1, 2, 3, 0]
 MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
+_PLANE = 0
+"""Type of planes, mjGEOM_PLANE."""
 _HEIGHT_FIELD = 1
 """Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
@@ -88,6 +89,28 @@ class ModelReader:
         self._meshes: dict[tuple[int, bool], TriMesh] = {}
         self._read_texts()
         rules.check([*self._names, *self._flex_names])
+
+    def seen(self, groups: Collection[int] | None) -> list[int]:
+        """The geoms that ``groups`` and the rules' choice of shapes keep."""
+        m = self.model
+        kept = [k for k in range(m.ngeom) if groups is None or int(m.geom_group[k]) in groups]
+        collides = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+        collides[[*m.pair_geom1, *m.pair_geom2]] = True
+        boxes = np.array([self._box(k) for k in kept]).reshape(-1, 2, 3)
+        owner = m.geom_bodyid[kept] - 1  # the world is the first body
+        instead = self.rules.replaced(collides[kept], owner, boxes)
+        return [k for k, other in zip(kept, instead.tolist(), strict=True) if not other]
+
+    def _box(self, geom: int) -> Array:
+        """Corners of a box around a geom in the frame of its body [m], NaN for planes, (2, 3)."""
+        m = self.model
+        if m.geom_type[geom] == _PLANE:
+            return np.full((2, 3), np.nan)
+        x, y, z, w = np.take(m.geom_quat[geom], _SCALAR_LAST).tolist()
+        pose = Pose(m.geom_pos[geom].tolist(), (x, y, z, w))
+        middle, half = m.geom_aabb[geom, :3], m.geom_aabb[geom, 3:]
+        reach = np.abs(pose.rotation) @ half
+        return pose.apply(middle) + np.stack([-reach, reach])
 
     def excludes(self, geom: int) -> bool:
         """Whether the rules leave a geom out."""
@@ -288,23 +311,22 @@ class ModelSource(WorldSource):
                 raise SceneError(
                     f"groups: nothing is in group {group!r}; there are geoms in {sorted(there)}"
                 )
-        self.geoms = [
-            i for i in range(model.ngeom) if groups is None or int(model.geom_group[i]) in groups
-        ]
-        """The geoms of these groups."""
-        self._chosen = groups is not None
+        self.groups = groups
+        """The groups that are seen, None for all."""
         super().__init__(rules)
 
     def refresh(self) -> None:
         super().refresh()
         self.reader = ModelReader(self.model, self.rules)
+        self.geoms = self.reader.seen(self.groups)
+        """The geoms that are seen, as far as no pattern excludes them."""
         self._made: dict[int, Solid | None] = {}
         self._known = [a.copy() for a in self._sizes()]
         self._set_back = self._bad_numbers()
 
     def solids(self, own: int | None) -> list[Solid]:
         """All solids but those of a body; of one mesh twice at one place, the first."""
-        kept: dict[object, tuple[int, Solid]] = {}
+        kept: dict[object, Solid] = {}
         for geom in self.geoms:
             if int(self.model.geom_bodyid[geom]) == own:
                 continue
@@ -313,30 +335,8 @@ class ModelSource(WorldSource):
             s = self._made[geom]
             if s is not None:  # geoms share the shapes of meshes
                 place = tuple(s.pose.position), tuple(s.pose.quaternion)
-                kept.setdefault((s.frame, id(s.shape), place, s.material, s.tie), (geom, s))
-        self._warn_of_twins(np.array([geom for geom, _ in kept.values()], dtype=int))
-        return [solid for _, solid in kept.values()]
-
-    def _warn_of_twins(self, geoms: NDArray[np.int64]) -> None:
-        """Warn, once, of bodies seen as what collides and as what is only drawn."""
-        m = self.model
-        collide = (m.geom_contype[geoms] != 0) | (m.geom_conaffinity[geoms] != 0)
-        body = m.geom_bodyid[geoms]
-        twice = np.intersect1d(body[collide], body[~collide])
-        twice = twice[twice > 0]
-        groups = m.geom_group[geoms]
-        some = np.isin(body, twice)
-        solid, drawn = (np.unique(groups[some & c]).tolist() for c in (collide, ~collide))
-        if not self._chosen and len(twice) and not set(solid) & set(drawn):
-            listed = ", ".join(repr(m.body(int(b)).name) for b in twice[:3]) + ", …" * (
-                len(twice) > 3
-            )
-            warnings.warn(
-                f"sensor: bodies {listed} are seen twice, as geoms that collide (groups={solid}) "
-                f"and as geoms that are only drawn (groups={drawn}); give attach one of the two",
-                stacklevel=2,
-            )
-        self._chosen = True
+                kept.setdefault((s.frame, id(s.shape), place, s.material, s.tie), s)
+        return list(kept.values())
 
     def contacts(self, frame: int) -> list[Contact]:
         import mujoco
@@ -363,6 +363,13 @@ class ModelSource(WorldSource):
     def robot(self, frame: int) -> set[int]:
         root = self.model.body_rootid
         return set(np.flatnonzero(root == root[frame]).tolist())
+
+    def neighbours(self, frame: int) -> set[int]:
+        m = self.model
+        weld, root = m.body_weldid, m.body_rootid == m.body_rootid[frame]
+        above = weld[m.body_parentid[weld]]  # what the joints of each body are on
+        near = (weld == weld[frame]) | (above == weld[frame]) | (weld == above[frame])
+        return set(np.flatnonzero(near & root).tolist())
 
     def soft(self, own: int | None) -> list[SoftSolid]:
         soft = [self.reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]

@@ -41,7 +41,7 @@ class WarpOptions(FleetOptions, total=False):
     """Keywords of :class:`CapacitiveSensors`."""
 
     groups: Collection[int] | None
-    """See only geoms of these groups; default all."""
+    """See only geoms of these groups; default all. Of these, ``shapes`` chooses."""
     warp_model: Any
     """``mujoco_warp.Model``, whose ``geom_size`` is followed where worlds have sizes of their own;
     by default geoms are seen as they are in the MuJoCo model."""
@@ -83,9 +83,7 @@ class CapacitiveSensors(ParallelSensors):
         reader = ModelReader(model, rules)
         geoms: list[int] = []
         parts: list[WorldShape] = []
-        for geom in range(model.ngeom):
-            if groups is not None and int(model.geom_group[geom]) not in groups:
-                continue
+        for geom in reader.seen(groups):
             solid = reader.solid(geom)
             if solid is None:
                 continue

@@ -26,8 +26,10 @@ from capsense.adapters.world import HalfSpace
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.reading import FleetReading
-from capsense.scene import Body, Shape
+from capsense.scene import Body, Pose, Shape
 from capsense.simulator import DEFAULT_DESIGN
+
+Array = NDArray[np.float64]
 
 _BASE = 0.1
 """Depth of the floor of a height field below its lowest point, over its half width."""
@@ -75,7 +77,8 @@ class SensorCapacitance(ParallelSensors):
         columns: list[int] = []
         left: list[str] = []
         carrier, trees = model.shape_body.numpy(), _trees(model)
-        for column in np.flatnonzero(~site).tolist():
+        instead = reader.replaced(table[0], labels)
+        for column in np.flatnonzero(~site & ~instead).tolist():
             if not reader.known(table[0, column]):
                 left.append(labels[column])
                 continue
@@ -217,6 +220,36 @@ class _Reader:
                 kinds.MESH, kinds.CONVEX_MESH, kinds.PLANE, kinds.HFIELD,
             )
         }  # fmt: skip
+
+    def replaced(self, shapes: NDArray[np.int64], labels: Sequence[str]) -> NDArray[np.bool_]:
+        """Which shapes of a world the rules' choice leaves out, as others stand for them."""
+        from newton import ShapeFlags
+
+        model = self._model
+        flags = model.shape_flags.numpy()[shapes]
+        site = (flags & int(ShapeFlags.SITE)) != 0
+        boxes = np.full((len(shapes), 2, 3), np.nan)
+        place = model.shape_transform.numpy()[shapes].tolist()
+        for k in np.flatnonzero(~site).tolist():
+            if self.known(shapes[k]) and self.ground(shapes[k], labels[k]) is None:
+                low, high = self._bounds(shapes[k], labels[k])
+                pose = Pose(place[k][:3], place[k][3:])
+                reach = np.abs(pose.rotation) @ (0.5 * (high - low))
+                boxes[k] = pose.apply(0.5 * (low + high)) + np.stack([-reach, reach])
+        owner = np.where(site, -2, model.shape_body.numpy()[shapes])
+        collides = (flags & int(ShapeFlags.COLLIDE_SHAPES)) != 0
+        return self._rules.replaced(collides, owner, boxes) & ~site
+
+    def _bounds(self, shape: int, label: str) -> Array:
+        """Corners of the box around a shape in its own frame [m], shape (2, 3)."""
+        kind, size = int(self._type[shape]), tuple(self._scale[shape].tolist())
+        made = primitive(self._kinds(kind).name, size)
+        if made is None and kind == int(self._kinds.HFIELD):
+            made = self._terrain(shape, label)
+        if made is not None:
+            return np.asarray(made.bounds())
+        corners = np.asarray(self._source[shape].vertices, float) * np.array(size)
+        return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     def look(self) -> None:
         """Take over the sizes of the model."""

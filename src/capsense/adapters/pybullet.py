@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters import DepthSensor, GeometrySensor, make_simulator, refuse_missing
+from capsense.adapters.findings import Findings
+from capsense.adapters.placement import markers
 from capsense.adapters.pybullet_bodies import (
     BodyWatch,
     Link,
@@ -29,7 +31,7 @@ from capsense.adapters.rules import (
     check_perception,
     split_rules,
 )
-from capsense.adapters.skin import AttachedSkin, clear_of_neighbours, simulators_of
+from capsense.adapters.skin import AttachedSkin, Progress, clear_of_neighbours, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, require_package
@@ -42,7 +44,6 @@ from capsense.simulator import DEFAULT_DESIGN, Simulator
 from capsense.skin import AnyDesign, SkinLayout
 
 Array = NDArray[np.float64]
-Shapes = Literal["collision", "visual"]
 
 __all__ = [
     "AttachedSkin", "PybulletDepthSensor", "PybulletOptions", "PybulletSensor", "attach",
@@ -66,9 +67,6 @@ _ONLY = {
 class PybulletSkinOptions(AttachOptions, total=False):
     """Keywords of :func:`attach_skin`."""
 
-    shapes: Shapes
-    """``"collision"``, the default: what Bullet collides with, where a mesh is the convex hull of
-    each of its connected parts; or ``"visual"``: what it draws, meshes as they are."""
     contact_forces: bool
     """Whether the forces of Bullet's contacts press links onto the design's cover, True by default;
     of links without contact, the overlap with the cover counts."""
@@ -132,7 +130,6 @@ def attach(
     require_package("pybullet", "PyBullet", "pybullet")
     check_perception(perception, options, _ONLY)
     rules, other = split_rules(options, PybulletOptions)
-    shapes = _checked_shapes(other.pop("shapes", "collision"))
     pose = checked_pose(pose_in_link, "pose_in_link")
     number = _client_number(client)
     mount = Mount(body, _find_link(number, body, link), pose)
@@ -142,7 +139,7 @@ def attach(
         image = Image.of(other, simulator.design)
         sensor = PybulletDepthSensor(number, mount, simulator, rules, image)
     else:
-        sensor = PybulletSensor(ClientSource(number, rules, shapes), mount, simulator)
+        sensor = PybulletSensor(ClientSource(number, rules), mount, simulator)
         sensor.contact_forces = bool(other.get("contact_forces", True))
     sensor.use_readout(sensor.readout if readout is None else readout)
     sensor.warn()
@@ -157,6 +154,7 @@ def attach_skin(
     *,
     readout: Readout | str | Path | None = None,
     threads: int | None = None,
+    progress: Progress | None = None,
     **options: Unpack[PybulletSkinOptions],
 ) -> AttachedSkin:
     """Attach several sensors to a robot's links; one ``read()`` reads them all, in parallel.
@@ -174,6 +172,8 @@ def attach_skin(
             :meth:`~capsense.adapters.skin.AttachedSkin.use_readout`; by default that of the
             simulator, if one is given.
         threads: How many threads read; by default as many as the process may use processors.
+        progress: Called with a stage's name and the fraction done. What is worked out is kept, also
+            if it is interrupted.
         options: As for :func:`attach`: those of :class:`PybulletSkinOptions`.
 
     Raises:
@@ -187,20 +187,19 @@ def attach_skin(
     """
     require_package("pybullet", "PyBullet", "pybullet")
     rules, other = split_rules(options, PybulletSkinOptions)
-    shapes = _checked_shapes(other.get("shapes", "collision"))
     number = _client_number(client)
     places: dict[str, Mount] = {}
     for name, mount in mounts.items():
         if not (isinstance(mount, tuple) and len(mount) == 2 and isinstance(mount[1], Pose)):
             raise SceneError(f"mount {name!r} is {mount!r}; give a pair (link, Pose(…))")
         places[name] = Mount(body, _find_link(number, body, mount[0]), mount[1])
-    source = ClientSource(number, rules, shapes)
-    simulators = simulators_of(places, design)
+    source = ClientSource(number, rules)
+    simulators = simulators_of(places, design, progress)
     sensors = {k: PybulletSensor(source, mount, simulators[k]) for k, mount in places.items()}
     for sensor in sensors.values():
         sensor.contact_forces = bool(other.get("contact_forces", True))
     skin = AttachedSkin(sensors, readout, threads)
-    skin.warn()
+    skin.warn(progress)
     return skin
 
 
@@ -212,6 +211,7 @@ def attach_layout(
     *,
     readout: Readout | str | Path | None = None,
     threads: int | None = None,
+    progress: Progress | None = None,
     **options: Unpack[PybulletSkinOptions],
 ) -> AttachedSkin:
     """Attach the patches of a layout to a link; one ``read()`` reads them all.
@@ -225,6 +225,7 @@ def attach_layout(
         layout: What ``cs.skin.from_mesh``, ``from_taxels`` or ``paint`` returns.
         readout: As of :func:`attach_skin`.
         threads: As of :func:`attach_skin`.
+        progress: As of :func:`attach_skin`.
         options: As of :func:`attach_skin`.
 
     Raises:
@@ -238,16 +239,17 @@ def attach_layout(
     require_package("pybullet", "PyBullet", "pybullet")
     import pybullet as p
 
-    rules, other = split_rules(options, PybulletSkinOptions)
+    rules, _ = split_rules(options, PybulletSkinOptions)
     number = _client_number(client)
-    source = ClientSource(number, rules, _checked_shapes(other.get("shapes", "collision")))
+    source = ClientSource(number, rules)
     at = _find_link(number, body, link)
     inertial = p.getDynamicsInfo(body, at, physicsClientId=number)[3:5]
     clear = clear_of_neighbours(layout, source, source.index(body, at), Pose(*inertial).inverse())
     mounts = {name: (at, pose) for name, (_, pose) in clear.items()}
     return attach_skin(
-        client, body, mounts, clear.designs, readout=readout, threads=threads, **options
-    )
+        client, body, mounts, clear.designs, readout=readout, threads=threads,
+        progress=progress, **options,
+    )  # fmt: skip
 
 
 class PybulletSensor(GeometrySensor):
@@ -262,6 +264,11 @@ class PybulletSensor(GeometrySensor):
         """The body that carries the sensor, and its link, -1 for the base."""
         self._in_link = mount.pose_in_link
         super().__init__(simulator, source)
+
+    def check(self) -> Findings:
+        seen = self.world.names(self.source.clear)
+        names = [str(body.name) for body in self.scene() if body.name in seen]
+        return Findings([*super().check(), *markers(names, names)])
 
     def _take_over(self) -> None:
         import pybullet as p
@@ -352,12 +359,6 @@ class PybulletDepthSensor(DepthSensor):
             conducts = matter.is_conductor()
             self._eps_r[code] = np.inf if conducts else matter.eps_r
         return links
-
-
-def _checked_shapes(shapes: str) -> str:
-    if shapes not in ("collision", "visual"):
-        raise ValueError(f'shapes is {shapes!r}; choose "collision" or "visual"')
-    return shapes
 
 
 def _client_number(client: Any) -> int:

@@ -12,6 +12,8 @@ from capsense.errors import SceneError
 from capsense.scene import Material, Pose
 
 _WATCHES = itertools.count()
+_MOST_LINKS = 127
+"""Links beside its base of which PyBullet gives the states; of a body with more, of none."""
 _SOFT_BODY = 3
 """Bullet's body type of deformables, entry 10 of ``getDynamicsInfo``."""
 BODY_NAME, LINK_NAME = "capsense.body", "capsense.link"
@@ -110,13 +112,27 @@ def gone(body: int) -> SceneError:
 
 
 def links_of(client: int, body: int) -> list[Link]:
-    """The base and the links of a body, in order, by the names that user data give them, if any."""
+    """The base and the links of a body, in order, by the names that user data give them, if any.
+
+    Raises:
+        SceneError: It has more links than PyBullet gives the states of.
+    """
     import pybullet as p
 
+    count = p.getNumJoints(body, physicsClientId=client)
+    if count > _MOST_LINKS:
+        name = p.getBodyInfo(body, physicsClientId=client)[1].decode() or f"body{body}"
+        joints = [p.getJointInfo(body, k, physicsClientId=client)[2] for k in range(count)]
+        raise SceneError(
+            f"body {body}, {name!r}, has {count} links beside its base, and PyBullet gives the "
+            f"states of {_MOST_LINKS} at most; load it with flags=pybullet.URDF_MERGE_FIXED_LINKS, "
+            f"which joins its {joints.count(p.JOINT_FIXED)} fixed links to others, or make a model "
+            "of fewer links"
+        )
     base, title = (n.decode() for n in p.getBodyInfo(body, physicsClientId=client))
     title = _user_data(client, body, -1, BODY_NAME) or title or f"body{body}"
     names = [base or "base"]
-    for joint in range(p.getNumJoints(body, physicsClientId=client)):
+    for joint in range(count):
         names.append(p.getJointInfo(body, joint, physicsClientId=client)[12].decode())
     names = [_user_data(client, body, i - 1, LINK_NAME) or name for i, name in enumerate(names)]
     return [

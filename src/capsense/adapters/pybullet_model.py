@@ -102,15 +102,13 @@ class ClientSource(WorldSource):
     Args:
         client: Number of the physics client.
         rules: What is seen, and what it is made of.
-        shapes: ``"collision"`` or ``"visual"``.
 
     Raises:
         SceneError: A pattern fits nothing.
     """
 
-    def __init__(self, client: int, rules: Rules, shapes: str) -> None:
+    def __init__(self, client: int, rules: Rules) -> None:
         self.client = client
-        self._shapes = shapes
         self._watch = BodyWatch(client)
         super().__init__(rules)
         check_patterns(rules, self._links)
@@ -126,6 +124,8 @@ class ClientSource(WorldSource):
         self._meshes: dict[tuple[object, ...], Shape] = {}
         self._notes: list[str] = []  # what was left out or replaced, and why
         self._made: dict[int, list[Solid]] = {}
+        self.clear: set[int] = set()
+        """Links that are only drawn, and can be seen through."""
 
     def index(self, body: int, link: int) -> int:
         """Number of a link's frame.
@@ -174,6 +174,25 @@ class ClientSource(WorldSource):
         body = self._links[frame].body
         return {number for number, link in enumerate(self._links) if link.body == body}
 
+    def neighbours(self, frame: int) -> set[int]:
+        import pybullet as p
+
+        body = self._links[frame].body
+        numbers = sorted(self.robot(frame))  # the base and the links, in order
+        joints = [p.getJointInfo(body, k, self.client) for k in range(len(numbers) - 1)]
+        weld = list(range(len(numbers)))  # the first of what is fixed together
+        above = [-1] * len(numbers)
+        for k, joint in enumerate(joints, start=1):  # a parent comes before its children
+            parent = weld[joint[16] + 1]
+            weld[k] = parent if joint[2] == p.JOINT_FIXED else k
+            above[k] = above[parent] if joint[2] == p.JOINT_FIXED else parent
+        own = numbers.index(frame)
+        return {
+            number
+            for k, number in enumerate(numbers)
+            if weld[k] == weld[own] or weld[own] == above[k] or weld[k] == above[own]
+        }
+
     def soft(self, own: int | None) -> list[SoftSolid]:
         numbers = [i for i, k in enumerate(self._links) if i != own and is_soft(self.client, k)]
         return [soft for i in numbers for soft in self._soft_of(i)]
@@ -203,7 +222,7 @@ class ClientSource(WorldSource):
         if self.rules.excludes(link.names):
             return
         material, tie = matter_of(self.client, link, self.rules)
-        for shape, pose in self._shapes_of(link):
+        for shape, pose in self._shapes_of(index):
             yield Solid(
                 label=link.names[-1],
                 shape=shape,
@@ -227,10 +246,11 @@ class ClientSource(WorldSource):
         material, tie = matter_of(self.client, link, self.rules)
         return [SoftSolid(link.names[-1], mesh.faces, mesh.vertices, material, tie, tree=link.body)]
 
-    def _shapes_of(self, link: Link) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
-        """Shapes, and their poses in the frame of the link's centre of mass."""
+    def _shapes_of(self, index: int) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
+        """Shapes of a link, and their poses in the frame of its centre of mass."""
         import pybullet as p
 
+        link = self._links[index]
         dynamics = p.getDynamicsInfo(link.body, link.link, physicsClientId=self.client)
         drawn = p.getVisualShapeData(link.body, physicsClientId=self.client)
         drawn = [entry for entry in drawn if entry[1] == link.link]
@@ -240,32 +260,49 @@ class ClientSource(WorldSource):
                 "bounds (left out)"
             )
             return
-        if self._shapes == "visual":
-            to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
-            flat = lost = False
-            for entry in drawn:
-                if entry[2] == p.GEOM_PLANE:  # its normal is told of the collision shape only
-                    flat = True
-                    continue
-                if self._is_nothing(link, entry):
-                    continue
-                try:
-                    shape = self._visual(link, entry)
-                except UnusableShape as error:
-                    self._notes.append(f"{error} (its link's collision shapes are taken)")
-                    lost = True
-                    continue
-                flat = flat or shape is None
-                if shape is not None:
-                    yield shape, to_mass @ Pose(entry[5], entry[6])
-            if not (flat or lost):
-                return
         # entries 0 and 1 are sound in the first record of a link only
         data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
-        if self._shapes == "visual" and not data and flat:
-            self._notes.append(
-                f"{link.names[-1]!r} has a flat visual mesh and no collision shape (left out)"
-            )
+        preferred, seen = self.rules.shapes, False
+        if preferred == "collision":
+            for found in self._solid_shapes(link, data):
+                seen = True
+                yield found
+            if seen:
+                return
+        if not data and any(entry[7][3] < 1 for entry in drawn):
+            self.clear.add(index)
+        to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
+        more = preferred == "both"
+        for entry in drawn:
+            if entry[2] == p.GEOM_PLANE:  # its normal is told of the collision shape only
+                more = True
+                continue
+            if self._is_nothing(link, entry):
+                continue
+            try:
+                shape = self._visual(link, entry)
+            except UnusableShape as error:
+                taken = bool(data) and preferred != "collision"
+                instead = "its link's collision shapes are taken" if taken else "left out"
+                self._notes.append(f"{error} ({instead})")
+                more = True
+                continue
+            if shape is not None:
+                seen = True
+                yield shape, to_mass @ Pose(entry[5], entry[6])
+                continue
+            more = True
+            if not data:
+                self._notes.append(
+                    f"{link.names[-1]!r} has a flat visual mesh and no collision shape (left out)"
+                )
+        if preferred != "collision" and (more or not seen):
+            yield from self._solid_shapes(link, data)
+
+    def _solid_shapes(
+        self, link: Link, data: Sequence[Any]
+    ) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
+        """What a link collides with, from the entries that PyBullet has of it."""
         for number, entry in enumerate(data):
             if self._is_nothing(link, entry):
                 continue

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capsense._validate import as_number, as_whole, shorten, suggest
 from capsense.design.model import Design
@@ -17,6 +18,8 @@ from capsense.scene.materials import Grounding, checked_grounding, checked_mater
 
 Names = tuple[str, ...]
 """The names that one solid answers to, such as those of its geom and of its body."""
+Shapes = Literal["collision", "visual", "both"]
+"""Which shapes of a link are seen."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,10 @@ class AttachOptions(SeenOptions, total=False):
     """Name pattern → grounding; a capacitance is that of all that the pattern fits together."""
     hull: Sequence[str]
     """Name patterns of meshes that are taken as their convex hulls."""
+    shapes: Shapes
+    """Which shapes of a link are seen: ``"collision"``, the default, those that collide, and those
+    that are only drawn where none that collide stand in their place; ``"visual"``, the other way
+    round; or ``"both"``, all of them."""
 
 
 class ImageOptions(TypedDict, total=False):
@@ -105,6 +112,7 @@ class Rules:
     """The values of :class:`AttachOptions`, checked.
 
     Raises:
+        ValueError: There is no such choice of shapes.
         SceneError: An unknown material or a wrong grounding.
     """
 
@@ -115,8 +123,12 @@ class Rules:
     exclude: Sequence[str] = ()
     exclude_own: bool = True
     hull: Sequence[str] = ()
+    shapes: Shapes = "collision"
 
     def __post_init__(self) -> None:
+        if self.shapes not in get_args(Shapes):
+            known = ", ".join(f'"{each}"' for each in get_args(Shapes)[:-1])
+            raise ValueError(f'shapes is {self.shapes!r}; choose {known} or "both"')
         put = object.__setattr__
         for key, checked in (("materials", checked_material), ("grounding", checked_grounding)):
             value = getattr(self, key) or {}
@@ -162,6 +174,40 @@ class Rules:
     def body(self, shape: Shape, names: Names) -> Body:
         """A shape as a body at the origin, where the model says nothing of its own."""
         return Body(shape, Pose(), self.material_of(names), self.tie_of(names).grounding)
+
+    def replaced(
+        self, collides: NDArray[np.bool_], owner: NDArray[np.integer], boxes: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """The shapes that others of their link stand for, by :attr:`AttachOptions.shapes`.
+
+        One is replaced if the middle of its box lies in the box around the link's shapes of the
+        preferred kind. The world itself carries things that have nothing to do with each other:
+        there it must lie in the box of one of them.
+
+        Args:
+            collides: Whether each collides, or is only drawn, shape (n,).
+            owner: The link that carries it, negative for the world itself, shape (n,).
+            boxes: Corners of a box around it in the link's frame [m], NaN for what has no end,
+                shape (n, 2, 3).
+
+        Returns:
+            Shape (n,).
+        """
+        out = np.zeros(len(owner), dtype=bool)
+        if self.shapes == "both":
+            return out
+        preferred = collides == (self.shapes == "collision")
+        preferred &= ~np.isnan(boxes).any(axis=(1, 2))
+        for link in np.unique(owner[preferred]).tolist():
+            known = boxes[preferred & (owner == link)]
+            if link >= 0:
+                known = np.array([[known[:, 0].min(axis=0), known[:, 1].max(axis=0)]])
+            others = np.flatnonzero((owner == link) & (collides != (self.shapes == "collision")))
+            middle = boxes[others].mean(axis=1)[:, None]
+            out[others] = (
+                ((known[:, 0] <= middle) & (middle <= known[:, 1])).all(axis=2).any(axis=1)
+            )
+        return out
 
     def excludes(self, names: Names) -> bool:
         """Whether something of these names is left out."""

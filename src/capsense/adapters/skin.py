@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +11,14 @@ import numpy as np
 from capsense._thread_pool import ForkSafeRLock, ThreadPool
 from capsense._validate import suggest
 from capsense.adapters import GeometrySensor, WorldSource
-from capsense.adapters.placement import blind, is_rough
+from capsense.adapters.findings import SkinFindings
+from capsense.adapters.placement import BLIND, blind
 from capsense.adapters.world import Frames, World
 from capsense.design.model import Domain
 from capsense.errors import SceneError, listed
 from capsense.reading import Reading
 from capsense.readout import Readout
-from capsense.scene import Pose
+from capsense.scene import Pose, Scene
 from capsense.simulator import Simulator
 from capsense.skin import (
     AnyDesign,
@@ -27,6 +28,8 @@ from capsense.skin import (
     reset_all,
     use_readouts,
 )
+
+Progress = Callable[[str, float], None]
 
 
 class AttachedSkin:
@@ -60,7 +63,19 @@ class AttachedSkin:
         else:
             self.use_readout(readout)
 
-    def read(self, time: float | None = None) -> dict[str, Reading]:
+    def views(self) -> dict[str, Scene]:
+        """What each sensor sees at the present state, by name, in its own frame.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+        """
+        with self._one:
+            links = self._source.links()
+            return {name: sensor.scene(links) for name, sensor in self.sensors.items()}
+
+    def read(
+        self, time: float | None = None, views: Mapping[str, Scene] | None = None
+    ) -> dict[str, Reading]:
         """The readings of the simulator's present state, by name.
 
         They are those that the sensors would give one by one, to the last bit.
@@ -68,6 +83,7 @@ class AttachedSkin:
         Args:
             time: Time of the state [s], for readouts; by default the simulator's own, where it
                 tells it.
+            views: What :meth:`views` has just given, if that was asked already.
 
         Raises:
             SkinError: Some sensors failed; it holds the readings of the others.
@@ -75,43 +91,53 @@ class AttachedSkin:
         """
 
         with self._one:
-            links = self._source.links()
+            links = self._source.links() if views is None else None
             for sensor in self.sensors.values():
                 sensor.catch_up()
             return read_all(
                 self._pool,
                 {name: sensor.simulator for name, sensor in self.sensors.items()},
-                lambda name: self.sensors[name].scene(links),
+                lambda name: self.sensors[name].scene(links) if views is None else views[name],
                 lambda name: self.sensors[name].time_of(time),
                 lambda name, reading: self.sensors[name].sampled(reading, time),
             )
 
-    def check(self) -> dict[str, list[str]]:
-        """What is wrong with each sensor, by name; see :meth:`AttachedSensor.check`.
+    def check(self, progress: Progress | None = None) -> SkinFindings:
+        """What is wrong with each sensor; see :meth:`AttachedSensor.check`.
+
+        Args:
+            progress: Called with a stage's name and the fraction done.
+
+        Returns:
+            Name → findings. ``.mounting`` and ``.scene`` are of all sensors together, a sentence
+            for each kind of finding with the worst one; so it is printed.
 
         Raises:
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
-        return {name: sensor.check() for name, sensor in self.sensors.items()}
+        out = SkinFindings()
+        for name, sensor in self.sensors.items():
+            if progress is not None:
+                progress("shapes that sensors see", len(out) / len(self))
+            out[name] = sensor.check()
+        if progress is not None:
+            progress("shapes that sensors see", 1.0)
+        return out
 
-    def warn(self) -> None:
-        """Warn of what :meth:`check` finds; some sensors of a skin may well see nothing."""
+    def warn(self, progress: Progress | None = None) -> None:
+        """Warn of what :meth:`check` finds; some sensors of a skin may well see nothing.
+
+        Args:
+            progress: As of :meth:`check`.
+        """
         try:
-            found = self.check()
+            found = self.check(progress)
         except SceneError:  # which the first reading will raise, too
             return
-        unseen = sum(blind(texts) for texts in found.values())
-        told: dict[str, list[str]] = {}  # finding → sensors
-        rough = [text for texts in found.values() for text in texts if is_rough(text)]
-        for name, texts in found.items():
-            for text in texts:
-                if not blind([text]) or unseen == len(self):
-                    one = rough[0] if is_rough(text) else text  # figures differ
-                    told.setdefault(one, []).append(name)
-        lines = [f"sensor {listed(names, 1)}: {text}" for text, names in told.items()]
-        if lines:
-            more = f";\nand {len(lines) - 4} more, see check()" if len(lines) > 4 else ""
-            warnings.warn(";\n".join(lines[:4]) + more, stacklevel=3)
+        if not all(blind(texts) for texts in found.values()):
+            found = found.without(BLIND)
+        if any(found.values()):
+            warnings.warn(f"{found}", stacklevel=3)
 
     @property
     def poses(self) -> dict[str, Pose]:
@@ -177,9 +203,16 @@ class AttachedSkin:
 
 
 def simulators_of(
-    names: Iterable[str], design: AnyDesign | Mapping[str, AnyDesign]
+    names: Iterable[str],
+    design: AnyDesign | Mapping[str, AnyDesign],
+    progress: Progress | None = None,
 ) -> dict[str, Simulator]:
     """Simulators for the sensors of a skin: all of one design, or each of its own.
+
+    Args:
+        names: Of the sensors.
+        design: A design, or name → design.
+        progress: As of a :class:`Simulator`.
 
     Raises:
         SceneError: Names repeat, or those of ``design`` are others.
@@ -191,14 +224,14 @@ def simulators_of(
         if names.count(name) > 1:
             raise SceneError(f"{name!r} is given {names.count(name)} times; once is enough")
     if not isinstance(design, Mapping):
-        return make_simulators(dict.fromkeys(names, design))
+        return make_simulators(dict.fromkeys(names, design), progress)
     for name in design:
         if name not in names:
             raise SceneError(f"design: no sensor is named {name!r}; {suggest(name, names)}")
     for name in names:
         if name not in design:
             raise SceneError(f"design: nothing is given for {name!r}; give a design for each")
-    return make_simulators({name: design[name] for name in names})
+    return make_simulators({name: design[name] for name in names}, progress)
 
 
 def clear_of_neighbours(

@@ -153,6 +153,9 @@ class World:
             self._bodies.append(
                 Body(shape, Pose(), solid.material, solid.tie.grounding, label, conductor=conductor)
             )
+        names = [body.conductor for body in self._bodies]
+        known = {name: k for k, name in enumerate(dict.fromkeys(names))} | {None: -1}
+        self._conductor = np.array([known[name] for name in names], np.int64)
         self._surfaces: list[DeformableSurface | None] = [None] * len(self.soft)
         self._layout = Layout(
             np.array([s.frame for s in self.solids], dtype=np.int64),
@@ -184,7 +187,8 @@ class World:
         if not np.isfinite(placed.position.sum() + placed.quaternion.sum()):
             bad = ~np.isfinite(placed.position.sum(axis=1) + placed.quaternion.sum(axis=1))
             raise _diverged(repr(self.solids[int(np.flatnonzero(bad)[0])].label))
-        seen = np.flatnonzero(placed.seen)
+        joined = self._conductor[placed.seen]
+        seen = np.flatnonzero(placed.seen | (np.isin(self._conductor, joined[joined >= 0])))
         bodies = [self._bodies[i] for i in seen.tolist()]
         poses = zip(placed.position[seen].tolist(), placed.quaternion[seen].tolist(), strict=True)
         parts = [

@@ -57,6 +57,8 @@ def replay(args: argparse.Namespace) -> int:
 
     Exit code 0: all the same. 3: something differs. 2: the file is no recording, or damaged.
 
+    Of a skin, all sensors are replayed, one after the other.
+
     Another processor, or another version of numba or NumPy, may change the last digits;
     --tolerance allows for that. A recording that was cut short is compared as far as it goes.
 
@@ -67,31 +69,35 @@ def replay(args: argparse.Namespace) -> int:
     """
     from tqdm import tqdm
 
-    from capsense.recording.reader import open_recording, replay
+    from capsense.recording.reader import open_all, replay
 
-    recording = open_recording(args.recording)
-    if not recording.complete:
+    recordings = open_all(args.recording)
+    if not recordings[0].complete:
         say(f"warning: {args.recording} was not closed; what was written until then is compared")
     shown = progress_shown(args.quiet)
     with (
         tqdm(unit=" steps", file=sys.stderr, disable=not shown) as bar,
         BuildProgress(quiet=args.quiet) as progress,
     ):
-        found = replay(
-            recording,
-            method=args.method,
-            tolerance=args.tolerance,
-            progress=progress,
-            each=lambda _: bar.update(),
-        )
-    if not args.quiet:
-        print(found)
-    if found.same:
-        return OK
-    say(f"the readings differ; first, {found.first}")
-    for key, (then, now) in found.changed.items():
-        say(f"recorded with {key} {then}, replayed with {now}")
-    return DIFFERS
+        results = {
+            recording.session.name: replay(
+                recording,
+                method=args.method,
+                tolerance=args.tolerance,
+                progress=progress,
+                each=lambda _: bar.update(),
+            )
+            for recording in recordings
+        }
+    several = len(results) > 1
+    for name, found in results.items():
+        if not args.quiet:
+            print(f"sensor       {name}\n{found}" if several else found)
+        if not found.same:
+            say(f"the readings{f' of {name}' if several else ''} differ; first, {found.first}")
+            for key, (then, now) in found.changed.items():
+                say(f"recorded with {key} {then}, replayed with {now}")
+    return OK if all(found.same for found in results.values()) else DIFFERS
 
 
 @command(
@@ -100,6 +106,7 @@ def replay(args: argparse.Namespace) -> int:
     arg("recording FILE.mcap", "the recording", type=Path),
     arg("-o --output FILE", "what to write", type=Path, required=True),
     arg("--counts", "the conversions of the readout in place of the readings (.csv, .parquet)"),
+    arg("--sensor NAME", "which sensor of a recorded skin"),
     arg("--force", "replace a file that is there"),
 )
 def export(args: argparse.Namespace) -> int:
@@ -115,12 +122,16 @@ def export(args: argparse.Namespace) -> int:
       capsense export hand.mcap -o counts.csv --counts
       capsense export killed.mcap -o whole.mcap
       capsense export hand.mcap -o layout.json
+      capsense export skin.mcap --sensor front -o front.csv
     """
     from capsense.recording.export import export
     from capsense.recording.files import check_target
-    from capsense.recording.reader import open_recording
+    from capsense.recording.reader import open_all, open_recording
 
-    recording = open_recording(args.recording)
+    whole = args.sensor is None and args.output.suffix.lower() == ".mcap"
+    recording = (
+        open_all(args.recording)[0] if whole else open_recording(args.recording, args.sensor)
+    )
     check_target(args.output, overwrite=args.force)
     if not recording.complete:
         say(f"warning: {args.recording} was not closed; what was written until then is exported")

@@ -163,6 +163,7 @@ def _address(text: str) -> tuple[int, int]:
     "show a sensor at work, live in a web browser",
     arg("scenario SCENARIO.toml", "the scenario file", type=Path, nargs="?"),
     arg("--replay FILE.mcap", "show a recording", type=Path),
+    arg("--name SENSOR", "which sensor of a recorded skin"),
     arg("--connect URL", "watch a server, ws://HOST:PORT"),
     arg(
         "--sensor CLIENT:SENSOR",
@@ -230,6 +231,7 @@ def _check_view(args: argparse.Namespace) -> None:
             f"{found} is given; give one of a scenario file, --replay FILE.mcap, --connect URL"
         )
     for option, value, only in (
+        ("--name", args.name, "--replay"),
         ("--sensor", args.sensor, "--connect"),
         ("--token-file", args.token_file, "--connect"),
         ("--rate", args.rate, "a scenario"),
@@ -258,7 +260,7 @@ def _player(args: argparse.Namespace) -> Playback:
         if args.replay is not None:
             from capsense.recording.reader import open_recording
 
-            return Player(RecordingSource(open_recording(args.replay), progress))
+            return Player(RecordingSource(open_recording(args.replay, args.name), progress))
     scenario = chosen_scenario(args)
     return Player(ScenarioSource(scenario, build_simulator(scenario, quiet=args.quiet)))
 

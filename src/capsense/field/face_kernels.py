@@ -16,7 +16,7 @@ from capsense._jit import kernel
 
 WALL_EDGE = 0.01
 """Bodies are out of the room so far beyond its bounds, over the domain's shortest side."""
-WALL_FADE_LENGTH = WALL_EDGE, 0.08
+WALL_FADE_LENGTH = 0.01, 0.08
 """They fade out over this distance up to there, over that side; the second of conductors that are
 not at ground, whose potential the walls would else hold as they come in. Next to the design, and
 behind its face, all fade over the first."""

@@ -223,9 +223,8 @@ def _packed(green: GreenFunction, design: Design) -> Green:
     gap, has_face = pack_gap(green.gap, green.clearance, design), math.isfinite(cover_of(design))
     inner, fade = fading(room, np.asarray(green.box, float), extent)
     space = Space(
-        has_face, gap.face, gap.curvature, room, extent,
-        inner, fade, gap.validity, gap.soft.limit,
-    )  # fmt: skip
+        has_face, gap.face, gap.curvature, room, extent, inner, fade, gap.validity, gap.soft.limit
+    )
     return Green(
         (near, middle, far),
         score_table,

@@ -78,7 +78,7 @@ class WarpCore:
                 "split number score part mix weight panel_end_fraction out": (n, views),
                 "node lifted extent softening_length barrier": (3 * n, views),
                 "outside_fraction near points unlifted": (3 * n, views),
-                "pose moved leader ground_elastance slot free": (places, views),
+                "pose moved leader ground_elastance slot free outside": (places, views),
                 "lossy width walled columns": (views,),
             },
         )
@@ -331,7 +331,9 @@ class WarpCore:
         """What is near the design, and what the gap law adds for it."""
         near = self.outlines, self.gap
         (chunks, _, views), launch = self.near.depth.shape, self.launch
-        launch(warp_near.connect, views, self.shapes, self.places, self.green, self.cut)
+        size = len(self.places.group), views
+        launch(warp_near.find_outside, size, self.shapes, self.places, self.green, self.cut)
+        launch(warp_near.connect, views, self.places, self.cut, self.green.terminals)
         if chunks:
             launch(warp_near.find_near, views, *near, self.cut, self.near)
             launch(warp_near.press, (views, chunks), *near, self.near)

@@ -119,6 +119,7 @@ class WarpActiveTree:
     mix: wp.array2d(dtype=wp.float32)  # the same in the functions solved for, see weigh, (n, v)
     weight: wp.array2d(dtype=wp.float32)
     barrier: wp.array2d(dtype=wp.float32)  # energy that keeps charge off [1/m], (l, v)
+    outside: wp.array2d(dtype=wp.vec4)  # what is out of reach: capacitance [m], middle, (b, v)
     free: wp.array2d(dtype=wp.int32)  # whether a body is a conductor that is not at ground, (b, v)
     walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)

@@ -129,24 +129,55 @@ def pack_gap(green: Green, gap: Gap, slots: int, device: Any) -> GapLaw:
     return out
 
 
-@wp.func
-def outside_capacitance(shapes: Shapes, places: Places, green: Response, at: wp.transform,
-                        e: int, b: int):  # fmt: skip
-    """What is out of reach of a body has in free space, as ``network_kernels``."""
+@wp.kernel
+def find_outside(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
+    """How much of conductors not at ground is out of reach, as ``network_kernels``."""
+    b, v = wp.tid()
+    e = v // places.hidden.shape[0]
+    cut.outside[b, v] = wp.vec4()
     u = places.choice[e, b]
+    loose = places.neutral[e, b] != 0 or places.ground_elastance[e, b][0] > 0.0
+    conducts = places.inverse_susceptibility[e, b] == wp.vec2()
+    if u < 0 or places.hidden[v % places.hidden.shape[0], b] != 0 or not (loose and conducts):
+        return
     first = shapes.first[u]
     scale = places.scale[e, b]
     outside = float(0.0)
+    middle = wp.vec3()
     for k in range(wp.min(_COARSE, 2 * shapes.functions[u] - 1)):
         part = shapes.children[first + k, 0]
         if part < 0 or part >= _COARSE - 1:  # else its parts stand for it
-            off = off_walls(wp.transform_point(at, scale * shapes.center[first + k]), 1, green)
-            outside += shapes.charge[first + k] * smooth(wp.length(off))
-    return scale * shapes.capacitance[u] * outside / shapes.charge[first]
+            at = wp.transform_point(cut.pose[b, v], scale * shapes.center[first + k])
+            share = shapes.charge[first + k] * smooth(wp.length(off_walls(at, 1, green)))
+            outside += share
+            middle += share * at
+    if outside > 0.0:
+        middle = middle / outside
+        whole = scale * shapes.capacitance[u] * outside / shapes.charge[first]
+        cut.outside[b, v] = wp.vec4(whole, middle[0], middle[1], middle[2])
+
+
+@wp.func
+def outside_capacitance(places: Places, cut: WarpActiveTree, group: int, v: int):
+    """Capacitance in free space of what is out of reach of a conductor, as ``network_kernels``."""
+    charge = float(0.0)
+    energy = float(0.0)
+    for b in range(places.group.shape[0]):
+        if places.group[b] == group and cut.outside[b, v][0] > 0.0:
+            one = cut.outside[b, v]
+            charge += one[0]
+            energy += one[0]
+            for c in range(b):
+                other = cut.outside[c, v]
+                if places.group[c] == group and other[0] > 0.0:
+                    off = wp.vec3(one[1] - other[1], one[2] - other[2], one[3] - other[3])
+                    least = wp.max(one[0], other[0])
+                    energy += 2.0 * one[0] * other[0] / wp.max(wp.length(off), least)
+    return wp.where(energy > 0.0, charge * charge / wp.max(energy, 1.0e-30), 0.0)
 
 
 @wp.kernel
-def connect(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
+def connect(places: Places, cut: WarpActiveTree, terminals: int):
     """What ties the bodies of a view to ground; places that are joined are one conductor.
 
     Those that are out of sight count for the tie, which is at least what is out of reach has in
@@ -183,11 +214,7 @@ def connect(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree
             conducts = places.inverse_susceptibility[e, b] == wp.vec2()
             if conducts and (neutral != 0 or tie[0] > 0.0):
                 cut.free[b, v] = 1
-                outside = float(0.0)
-                for c in range(places.group.shape[0]):
-                    joined = places.group[c] == places.group[b] and places.choice[e, c] >= 0
-                    if joined and places.hidden[v % places.hidden.shape[0], c] == 0:
-                        outside += outside_capacitance(shapes, places, green, cut.pose[c, v], e, c)
+                outside = outside_capacitance(places, cut, places.group[b], v)
                 if outside * _FLOATING_PENALTY > 1.0 and (neutral != 0 or tie[0] * outside > 1.0):
                     neutral = int(0)
                     tie = wp.vec2(1.0 / outside, 0.0)
@@ -198,7 +225,7 @@ def connect(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree
         cut.ground_elastance[b, v] = tie
         cut.slot[b, v] = -1
     cut.lossy[v] = lossy
-    cut.columns[v] = green.terminals
+    cut.columns[v] = terminals
 
 
 @wp.kernel

@@ -122,6 +122,8 @@ def close_openings(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArra
     return np.array(new_vertices), np.array(new_faces)
 
 
+_ALONG = 17
+"""Points along the axis of a capsule that are compared with those of others."""
 _BETWEEN_MASS = 1e-3
 """Mass [kg] of the shapeless links between the hinges of one joint in a URDF."""
 
@@ -133,8 +135,12 @@ def to_mjcf(
     material_name: str = "human",
     grounding: Grounding = 100e-12,
     damping: float = 1.0,
+    free: bool = False,
 ) -> str:
-    """A complete MuJoCo model of a limb, fixed to the world at its shoulder or hip.
+    """A complete MuJoCo model of a limb or person.
+
+    Its frame (shoulder, hip or wrist centre; of a person, between the hips) is fixed to the world,
+    or floats on a free joint. Segments that overlap at ease do not collide.
 
     Bodies are named ``right_arm_forearm``, geoms ``right_arm_forearm_1``, joints
     ``right_arm_elbow_flexion``. Texts in ``<custom>`` tell an attached sensor the material and
@@ -143,14 +149,16 @@ def to_mjcf(
     or paste :func:`mjcf_body`.
 
     Args:
-        limb: The limb.
+        limb: The limb or person.
         pose: Its frame in the world.
         material_name: Name of a known material.
         grounding: ``"grounded"``, ``"floating"`` or the capacitance [F] to ground of the person.
         damping: Damping of all joints [N m s/rad].
+        free: Whether a person floats; joint ``person_free``.
 
     Raises:
-        SceneError: No such material, or a wrong grounding.
+        SceneError: No such material, a wrong grounding, or a free limb: MuJoCo wants mass that the
+            frame carries along, as that of a person's pelvis.
     """
     known: Material = material(material_name)
     root = Element("mujoco", model=limb.name)
@@ -164,12 +172,30 @@ def to_mjcf(
     for key, value in (("material", known.name), ("grounding", tie)):
         SubElement(custom, "text", name=f"capsense.{key}:{limb.name}_*", data=str(value))
     world = SubElement(root, "worldbody")
-    world.append(_mjcf_element(limb, pose, damping))
+    base = _mjcf_element(limb, pose, damping)
+    world.append(base)
+    if free:
+        if not any(s.parent is None and not s.joints for s in limb.segments):
+            raise SceneError(
+                f"free is True, but nothing of {limb.name} is fixed to its frame; leave it False, "
+                "or attach the limb to a body that moves"
+            )
+        base.insert(0, Element("freejoint", name=f"{limb.name}_free"))
+    overlapping = _overlapping(limb)
+    if overlapping:
+        contact = SubElement(root, "contact")
+        for first, second in overlapping:
+            SubElement(
+                contact, "exclude",
+                body1=f"{limb.name}_{first}", body2=f"{limb.name}_{second}",
+            )  # fmt: skip
     return _text(root)
 
 
 def mjcf_body(limb: Chain, pose: Pose = Pose(), *, damping: float = 1.0) -> str:  # noqa: B008
     """The ``<body>`` element of a limb, to be pasted into a model that counts in degrees.
+
+    Other than in :func:`to_mjcf`, segments that overlap at ease collide.
 
     Args:
         limb: The limb.
@@ -180,20 +206,27 @@ def mjcf_body(limb: Chain, pose: Pose = Pose(), *, damping: float = 1.0) -> str:
 
 
 def to_urdf(limb: Chain) -> str:
-    """A URDF of a limb; its base link is its frame at the shoulder or hip.
+    """A URDF of a limb or person; its base link is its frame.
 
     Links are named ``right_arm_forearm``, joints ``right_arm_elbow_flexion``. Where a segment has
     several hinges, they are joined by light links without a shape. Capsules are written as
-    ``<capsule radius length>``, which Bullet reads and the URDF standard does not know.
+    ``<capsule radius length>``, which Bullet reads and the URDF standard does not know. PyBullet
+    takes 127 links; a person with detailed hands has 74.
 
     Args:
-        limb: The limb.
+        limb: The limb or person.
     """
     root = Element("robot", name=limb.name)
     _urdf_link(root, limb.name, None)
-    above = limb.name
     for segment in limb.segments:
         name = f"{limb.name}_{segment.name}"
+        above = limb.name if segment.parent is None else f"{limb.name}_{segment.parent}"
+        if not segment.joints:
+            _urdf_link(root, name, segment)
+            fixed = SubElement(root, "joint", name=f"{name}_fixed", type="fixed")
+            SubElement(fixed, "origin", xyz=_numbers(segment.origin), rpy="0 0 0")
+            SubElement(fixed, "parent", link=above)
+            SubElement(fixed, "child", link=name)
         for k, joint in enumerate(segment.joints):
             last = k == len(segment.joints) - 1
             link = name if last else f"{limb.name}_{joint.name}"
@@ -215,11 +248,12 @@ def to_urdf(limb: Chain) -> str:
 def _mjcf_element(limb: Chain, pose: Pose, damping: float) -> Element:
     x, y, z, w = pose.quaternion
     base = Element("body", name=limb.name, pos=_numbers(pose.position), quat=_numbers((w, x, y, z)))
-    above = base
+    bodies: dict[str | None, Element] = {None: base}
     for segment in limb.segments:
-        above = SubElement(
-            above, "body", name=f"{limb.name}_{segment.name}", pos=_numbers(segment.origin)
-        )
+        above = bodies[segment.name] = SubElement(
+            bodies[segment.parent], "body",
+            name=f"{limb.name}_{segment.name}", pos=_numbers(segment.origin),
+        )  # fmt: skip
         for joint in segment.joints:
             bounds = [math.degrees(joint.lower), math.degrees(joint.upper)]
             SubElement(
@@ -227,14 +261,28 @@ def _mjcf_element(limb: Chain, pose: Pose, damping: float) -> Element:
                 axis=_numbers(joint.axis), range=_numbers(bounds), limited="true",
                 damping=_number(damping),
             )  # fmt: skip
-        volume = sum(p.shape.volume for p in segment.parts)
         for name, part in limb.named_parts(segment):
             SubElement(
                 above, "geom", name=name, type="capsule", size=_number(part.radius),
                 fromto=_numbers((*part.start, *part.end)),
-                mass=_number(segment.mass * part.shape.volume / volume),
+                mass=_number(segment.mass * part.shape.volume / segment.volume),
             )  # fmt: skip
     return base
+
+
+def _overlapping(limb: Chain) -> list[tuple[str, str]]:
+    """Segments that overlap at ease, without those that hang on each other."""
+    where, points, radii, owner = limb.forward(limb.neutral), [], [], []
+    for k, segment in enumerate(limb.segments):
+        for part in segment.parts:
+            points.append(where[segment.name].apply(np.linspace(part.start, part.end, _ALONG)))
+            radii.append(part.radius)
+            owner.append(k)
+    near = [np.linalg.norm(a - points, axis=-1) for a in np.reshape(points, (-1, 3))]
+    gaps = np.reshape(near, (len(radii), _ALONG, len(radii), _ALONG)).min(axis=(1, 3))
+    met = {(owner[a], owner[b]) for a, b in np.argwhere(gaps < np.add.outer(radii, radii)).tolist()}
+    pairs = [(limb.segments[a], limb.segments[b]) for a, b in sorted(met) if a < b]
+    return [(a.name, b.name) for a, b in pairs if a.name != b.parent]
 
 
 def _urdf_link(root: Element, name: str, segment: Segment | None) -> None:

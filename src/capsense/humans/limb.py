@@ -1,176 +1,35 @@
-"""How large people are; arms and legs, as chains of capsules with joints.
+"""Arms, legs and hands, as trees of capsules with joints; what they share with whole people.
 
 At rest, all angles zero, a limb hangs straight down: x points forwards, y to the left, z up. The
-limb's frame stands at the shoulder or hip centre. Positive angles bend as the joint's name says,
-on both sides of the body alike.
-
-Lengths of segments are fractions of stature: R. Drillis and R. Contini, "Body Segment
-Parameters", Report 1166-03, New York University, 1966, as printed in D. A. Winter,
-"Biomechanics and Motor Control of Human Movement", 4th ed., Wiley, 2009, figure 4.1. Masses of
-segments are fractions of body mass: Winter, table 4.1.
-
-Circumferences are means over 4082 men and 1986 women: C. C. Gordon et al., "2012 Anthropometric
-Survey of U.S. Army Personnel: Methods and Summary Statistics" (ANSUR II), NATICK/TR-15/007,
-2014. Those of upper arm and forearm were taken flexed, so they are the largest. The survey's
-people are fit adults; others are reached with ``girth``.
-
-The spread of stature is the distance of the 5th from the 95th percentile in R. L. Huston,
-"Principles of Biomechanics", CRC Press, 2009 (men 1.649 to 1.869 m, women 1.518 to 1.724 m),
-divided by 2 · 1.645, as for a normal distribution.
+limb's frame stands at the shoulder, hip or wrist centre. Positive angles bend as the joint's name
+says, on both sides of the body alike.
 """
 
 from __future__ import annotations
 
 import math
-import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from importlib import resources
-from statistics import NormalDist
-from types import MappingProxyType
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from capsense._validate import suggest
 from capsense.errors import SceneError
+from capsense.humans.build import DATA, Build
 from capsense.humans.chain import Chain, Joint, LimbPart, Segment
+from capsense.humans.fingers import hand_segments
 from capsense.humans.formats import to_mjcf, to_urdf
 from capsense.scene import Body, Material, Pose
-from capsense.scene.materials import Grounding, checked_grounding
+from capsense.scene.materials import Grounding
 from capsense.scene.pose import checked_pose
 
-Sex = Literal["female", "male"]
 Side = Literal["left", "right"]
-
-DATA: Mapping[str, Any] = tomllib.loads(
-    resources.files("capsense.humans").joinpath("people.toml").read_text(encoding="utf-8")
-)
-"""The tables of ``people.toml``: sizes of people, and the segments of their limbs."""
-LENGTHS: Mapping[str, float] = MappingProxyType(DATA["lengths"])
-"""Lengths as fractions of stature (Drillis and Contini 1966)."""
-MASSES: Mapping[str, float] = MappingProxyType(DATA["masses"])
-"""Masses as fractions of body mass (Winter 2009)."""
-STATURE: Mapping[Sex, tuple[float, float]] = MappingProxyType(DATA["stature"])
-"""Mean [m] (ANSUR II) and standard deviation [m] (Huston 2009) of stature."""
-CIRCUMFERENCES: Mapping[str, Mapping[Sex, float]] = MappingProxyType(DATA["circumferences"])
-"""Mean circumferences [m] at mean stature (ANSUR II)."""
-HAND_BREADTH: Mapping[Sex, float] = MappingProxyType(DATA["hand_breadth"])
-"""Mean breadth of the hand at the knuckles [m] at mean stature (ANSUR II)."""
-ANKLE = 0.13
-"""Circumference of the ankle as a fraction of stature; an estimate, rounded."""
-BODY_MASS_INDEX = 25.0
-"""Body mass over stature squared [kg/m²] that masses are reckoned with; an assumption."""
-
-
-@dataclass(frozen=True)
-class Build:
-    """The size of a person.
-
-    Lengths follow stature; circumferences follow stature and ``girth``.
-
-    Raises:
-        SceneError: Another sex, or a number out of range.
-    """
-
-    sex: Sex = "male"
-    stature: float | None = None
-    """Height of the body [m]; by default that of the percentile."""
-    percentile: float = 50.0
-    """Percentile of stature within the sex; ignored where stature is given."""
-    girth: float = 1.0
-    """Factor on all circumferences. Those of forearms spread by about a tenth."""
-
-    def __post_init__(self) -> None:
-        if self.sex not in get_args(Sex):
-            raise SceneError(f'sex is {self.sex!r}; choose "female" or "male"')
-        _within("percentile", self.percentile, 0.1, 99.9, "")
-        _within("girth", self.girth, 0.5, 2.0, "")
-        if self.stature is None:
-            mean, spread = STATURE[self.sex]
-            stature = NormalDist(mean, spread).inv_cdf(self.percentile / 100)
-            object.__setattr__(self, "stature", stature)
-        else:
-            _within("stature", self.stature, 0.8, 2.3, " m")
-
-    @property
-    def height(self) -> float:
-        """Height of the body [m]."""
-        assert self.stature is not None
-        return self.stature
-
-    @property
-    def mass(self) -> float:
-        """Body mass [kg]."""
-        return BODY_MASS_INDEX * self.height**2
-
-    def length(self, name: str) -> float:
-        """A length [m] of :data:`LENGTHS`."""
-        return LENGTHS[name] * self.height
-
-    def segment_mass(self, name: str) -> float:
-        """The mass [kg] of a segment of :data:`MASSES`."""
-        return MASSES[name] * self.mass
-
-    def radius(self, name: str) -> float:
-        """The radius [m] of the circle that has a circumference of :data:`CIRCUMFERENCES`."""
-        if name == "ankle":
-            around = ANKLE * self.height
-        else:
-            around = CIRCUMFERENCES[name][self.sex] * self._scale
-        return self.girth * around / (2 * math.pi)
-
-    @property
-    def hand_breadth(self) -> float:
-        """Breadth of the hand at the knuckles [m]."""
-        return self.girth * HAND_BREADTH[self.sex] * self._scale
-
-    @property
-    def hand_thickness(self) -> float:
-        """Thickness [m] of a hand whose section is a stadium of known breadth and circumference.
-
-        Around a stadium of breadth b and thickness t run 2 (b − t) + π t.
-        """
-        around = 2 * math.pi * self.radius("hand")
-        return (around - 2 * self.hand_breadth) / (math.pi - 2)
-
-    @property
-    def _scale(self) -> float:
-        return self.height / STATURE[self.sex][0]
-
-
-def _within(name: str, value: object, low: float, high: float, unit: str) -> None:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not low <= value <= high:  # type: ignore[operator]
-        raise SceneError(f"{name} is {value!r}; give a number from {low:g} to {high:g}{unit}")
+Hands = Literal["simple", "detailed"]
 
 
 @dataclass(frozen=True)
 class Limb(Chain):
-    """An arm or a leg; made by :func:`arm` and :func:`leg`."""
-
-    def forward(
-        self, angles: Mapping[str, float] | None = None, *, degrees: bool = False
-    ) -> dict[str, Pose]:
-        """Poses of the segments in the limb's frame.
-
-        Args:
-            angles: Angle of each joint by name [rad]; those not given are zero.
-            degrees: Whether the angles are in degrees.
-
-        Raises:
-            SceneError: There is no such joint, or it does not bend so far.
-        """
-        checked = self._checked(angles or {}, degrees)
-        poses, here = {}, Pose()
-        for segment in self.segments:
-            here = here @ Pose(segment.origin)
-            for joint in segment.joints:
-                half = 0.5 * checked.get(joint.name, 0.0)
-                x, y, z = (math.sin(half) * a for a in joint.axis)
-                here = here @ Pose((0, 0, 0), (x, y, z, math.cos(half)))
-            poses[segment.name] = here
-        return poses
+    """A limb or person; made by :func:`arm`, :func:`leg`, :func:`hand` and :func:`person`."""
 
     def bodies(
         self,
@@ -184,26 +43,59 @@ class Limb(Chain):
         """The limb as bodies of a scene.
 
         Args:
-            pose: The limb's frame (shoulder or hip centre) in the sensor frame.
+            pose: The limb's frame (shoulder, hip or wrist centre, or between the hips) in the
+                sensor frame.
             angles: Angle of each joint by name [rad]; those not given are zero.
             degrees: Whether the angles are in degrees.
             material: What it is made of.
             grounding: ``"grounded"``, ``"floating"``, or the capacitance [F] that ties the
-                whole person to ground; the bodies share it. A standing person has about 100 pF.
+                whole person to ground, :func:`~capsense.humans.capacitance_to_ground` say. The
+                bodies are one conductor of the limb's name.
 
         Raises:
             SceneError: A joint, an angle, the material or the grounding is wrong.
         """
         checked_pose(pose)
-        tie = checked_grounding(grounding)
-        if not isinstance(tie, str):
-            tie /= sum(len(s.parts) for s in self.segments)
-        where = self.forward(angles, degrees=degrees)
+        where = {n: pose @ at for n, at in self.forward(angles, degrees=degrees).items()}
         return [
-            Body(part.shape, pose @ where[segment.name] @ part.pose, material, tie, name)
+            Body(
+                part.shape,
+                where[segment.name] @ part.pose,
+                material,
+                grounding,
+                name,
+                conductor=self.name,
+            )
             for segment in self.segments
             for name, part in self.named_parts(segment)
         ]
+
+    def on_floor(
+        self,
+        angles: Mapping[str, float] | None = None,
+        *,
+        degrees: bool = False,
+        turn: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        floor: float = 0.0,
+    ) -> Pose:
+        """The pose of the limb's frame, above the origin, whose lowest point is on a floor.
+
+        Args:
+            angles: Angle of each joint by name [rad]; those not given are zero.
+            degrees: Whether the angles are in degrees.
+            turn: Quaternion (x, y, z, w) of the frame, :data:`~capsense.humans.ON_BACK` say.
+            floor: Height of the floor [m]; soles or a seat lift it.
+
+        Raises:
+            SceneError: A joint, an angle or the quaternion is wrong.
+        """
+        turned, where = Pose((0.0, 0.0, 0.0), turn), self.forward(angles, degrees=degrees)
+        low = min(
+            float((turned @ where[s.name]).apply([p.start, p.end])[:, 2].min()) - p.radius
+            for s in self.segments
+            for p in s.parts
+        )
+        return Pose((0.0, 0.0, floor - low), turn)
 
     def mjcf(self, pose: Pose = Pose(), **options: object) -> str:  # noqa: B008
         """A MuJoCo model of the limb; see :func:`capsense.humans.formats.to_mjcf`."""
@@ -213,25 +105,13 @@ class Limb(Chain):
         """A URDF of the limb; see :func:`capsense.humans.formats.to_urdf`."""
         return to_urdf(self)
 
-    def _checked(self, angles: Mapping[str, float], degrees: bool) -> dict[str, float]:
-        """Angles [rad], refused where a joint is missing or does not bend so far."""
-        joints = {j.name: j for j in self.joints}
-        out = {}
-        for name, value in angles.items():
-            if name not in joints:
-                raise SceneError(f"{self.name} has no joint {name!r}; {suggest(name, joints)}")
-            joint = joints[name]
-            angle = math.radians(value) if degrees else float(value)
-            if not joint.lower - 1e-9 <= angle <= joint.upper + 1e-9:
-                raise SceneError(
-                    f"{self.name}: {name} is {math.degrees(angle):.4g} degrees; it bends from "
-                    f"{math.degrees(joint.lower):.4g} to {math.degrees(joint.upper):.4g}"
-                )
-            out[name] = angle
-        return out
 
-
-def arm(build: Build = Build(), side: Side = "right") -> Limb:
+def arm(
+    build: Build = Build(),  # noqa: B008, a build is immutable
+    side: Side = "right",
+    *,
+    hand: Hands = "simple",
+) -> Limb:
     """An arm: upper arm, forearm and hand.
 
     Joints: shoulder_flexion, shoulder_abduction, shoulder_rotation (inwards), elbow_flexion,
@@ -242,14 +122,16 @@ def arm(build: Build = Build(), side: Side = "right") -> Limb:
     Args:
         build: Size of the person.
         side: ``"left"`` or ``"right"``.
+        hand: ``"simple"``, five capsules that are one segment, or ``"detailed"``, as
+            :func:`hand` makes it.
 
     Raises:
-        SceneError: Another side.
+        SceneError: Another side or hand.
     """
-    return _limb("arm", build, side)
+    return Limb(f"{_sided(side)}_arm", arm_segments(build, side, hand))
 
 
-def leg(build: Build = Build(), side: Side = "right") -> Limb:
+def leg(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
     """A leg: thigh, shank and foot.
 
     Joints: hip_flexion, hip_abduction, hip_rotation (inwards), knee_flexion, ankle_flexion (toes
@@ -262,30 +144,88 @@ def leg(build: Build = Build(), side: Side = "right") -> Limb:
     Raises:
         SceneError: Another side.
     """
-    return _limb("leg", build, side)
+    return Limb(f"{_sided(side)}_leg", leg_segments(build, side))
 
 
-def _limb(kind: str, build: Build, side: Side) -> Limb:
-    """The limb that ``people.toml`` describes."""
-    s = _sign(side)
-    segments, origin = [], (0.0, 0.0, 0.0)
+def hand(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
+    """A hand with all its joints, which hangs on the wrist.
+
+    At rest the fingers hang down side by side, the palm faces the body, and the thumb points
+    forwards and down. Segments: palm; thumb_metacarpal, thumb_proximal, thumb_distal; and of index,
+    middle, ring and little, such as index_proximal, index_intermediate, index_distal. At rest
+    their frames are parallel.
+
+    Joints: wrist_flexion, wrist_deviation; thumb_cmc_flexion (to the fingers),
+    thumb_cmc_abduction (out of the plane of the palm), thumb_mcp_flexion, thumb_ip_flexion; and of
+    each finger, such as index_mcp_flexion, index_mcp_abduction (away from the middle finger; of
+    the middle finger, to the thumb), index_pip_flexion, index_dip_flexion. For sources see
+    :mod:`capsense.humans.fingers`.
+
+    Args:
+        build: Size of the person.
+        side: ``"left"`` or ``"right"``.
+
+    Raises:
+        SceneError: Another side.
+    """
+    mirror = _sign(side)
+    wrist = joints_of(DATA["arm"][-1]["joints"], mirror)
+    return Limb(f"{side}_hand", hand_segments(build, mirror, wrist, (0.0, 0.0, 0.0)))
+
+
+def arm_segments(build: Build, side: Side, hand: Hands) -> tuple[Segment, ...]:
+    """The segments of an arm, see :func:`arm`."""
+    if hand not in get_args(Hands):
+        raise SceneError(f'hand is {hand!r}; choose "simple" or "detailed"')
+    found = _segments("arm", build, side)
+    if hand == "simple":
+        return found
+    *above, last = found
+    detailed = hand_segments(build, _sign(side), last.joints, last.origin)
+    return (*above, replace(detailed[0], parent=last.parent), *detailed[1:])
+
+
+def leg_segments(build: Build, side: Side) -> tuple[Segment, ...]:
+    """The segments of a leg, see :func:`leg`."""
+    return _segments("leg", build, side)
+
+
+def _segments(kind: str, build: Build, side: Side) -> tuple[Segment, ...]:
+    """The segments of a limb that ``people.toml`` describes."""
+    mirror = _sign(side)
+    out: list[Segment] = []
+    origin, parent = (0.0, 0.0, 0.0), None
     for data in DATA[kind]:
         name, length = data["name"], build.length(data["name"])
         if name in ("hand", "foot"):
-            parts = _hand(build) if name == "hand" else _foot(build, s)
+            parts = _hand(build) if name == "hand" else _foot(build, mirror)
         else:
             mean = [(a, b, sum(map(build.radius, n)) / len(n)) for a, b, n in data["parts"]]
             parts = _along(length, mean)
-        joints = tuple(
-            Joint(
-                joint, (s * x + 0.0, float(y), s * z + 0.0), math.radians(low), math.radians(high)
-            )
-            for joint, (x, y, z), low, high in data["joints"]
-        )
         mass = build.segment_mass(name)
-        segments.append(Segment(name.replace(" ", "_"), origin, joints, parts, mass))
-        origin = (0.0, 0.0, -length)
-    return Limb(f"{side}_{kind}", tuple(segments))
+        name = name.replace(" ", "_")
+        out.append(Segment(name, origin, joints_of(data["joints"], mirror), parts, mass, parent))
+        origin, parent = (0.0, 0.0, -length), name
+    return tuple(out)
+
+
+def joints_of(data: Iterable[Any], mirror: float = 1.0) -> tuple[Joint, ...]:
+    """Joints as ``people.toml`` lists them; those of the left side mirror."""
+    return tuple(
+        Joint(
+            name,
+            (mirror * x + 0.0, float(y), mirror * z + 0.0),
+            math.radians(low),
+            math.radians(high),
+        )
+        for name, (x, y, z), low, high in data
+    )
+
+
+def _sided(side: str) -> str:
+    """The name of a side, checked."""
+    _sign(side)
+    return side
 
 
 def _sign(side: str) -> float:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from capsense._validate import suggest
 from capsense.codec import CHANGING, design_from_json, read_body, read_rest, read_shape
-from capsense.errors import RecordingError, SceneError
+from capsense.errors import RecordingError, SceneError, listed
 from capsense.reading import Reading, StepStats, Touch
 from capsense.readout.conversions import Counts
 from capsense.recording import (
@@ -87,15 +88,54 @@ class Recording:
                     yield step
 
 
-def open_recording(path: str | Path) -> Recording:
+def open_recording(path: str | Path, sensor: str | None = None) -> Recording:
     """Open a recording.
 
     Args:
-        path: A file that :class:`~capsense.recording.recorder.Recorder` wrote, closed or not.
+        path: A file that :func:`~capsense.recording.recorder.record` wrote, closed or not.
+        sensor: Which sensor of a skin; of a recording of one sensor, that one.
+
+    Raises:
+        RecordingError: There is no such file or sensor, none of several was named, or the file is
+            not a recording, or damaged.
+        MissingDependencyError: The optional packages are not installed.
+    """
+    file, complete, found, folders = _said(path)
+    names = [folder.removesuffix("/") for folder in folders if folder]
+    if sensor is None and len(names) > 1:
+        raise RecordingError(
+            f"{file} holds {len(names)} sensors; name one of them: {listed(names, 8)}"
+        )
+    if sensor is None or not names:
+        folder = folders[0]
+    elif sensor in names:
+        folder = f"{sensor}/"
+    else:
+        raise RecordingError(f"{file} has no sensor {sensor!r}; {suggest(str(sensor), names)}")
+    session = read_session(found[folder + SESSION], design_from_json(found[folder + DESIGN]))
+    if sensor not in (None, session.name):
+        raise RecordingError(f"{file} has no sensor {sensor!r}; it is of {session.name!r}")
+    return Recording(file, session, complete=complete)
+
+
+def open_all(path: str | Path) -> list[Recording]:
+    """The recordings of all sensors in a file.
+
+    Raises:
+        RecordingError: As by :func:`open_recording`.
+    """
+    names = [folder.removesuffix("/") or None for folder in _said(path)[3]]
+    return [open_recording(path, name) for name in names]
+
+
+def _said(path: str | Path) -> tuple[Path, bool, dict[str, bytes], list[str]]:
+    """What a file says once.
+
+    Returns:
+        The file, whether it was closed, its attachments, and where those of each sensor begin.
 
     Raises:
         RecordingError: There is no such file, or it is not a recording, or damaged.
-        MissingDependencyError: The optional packages are not installed.
     """
     require()
     from mcap.records import Attachment, Message, Metadata
@@ -114,13 +154,14 @@ def open_recording(path: str | Path) -> Recording:
             break
         if DESIGN in found and SESSION in found:
             break
-    if not marked or DESIGN not in found or SESSION not in found:
+    folders = [key.removesuffix(DESIGN) for key in found if f"/{key}".endswith(f"/{DESIGN}")]
+    folders = [folder for folder in folders if folder + SESSION in found]
+    if not marked or not folders:
         raise RecordingError(
             f"{file} is an MCAP file, but no recording of capsense: it lacks "
             f"{'the metadata ' + NAME if not marked else 'the attachments'}"
         )
-    session = read_session(found[SESSION], design_from_json(found[DESIGN]))
-    return Recording(file, session, complete=complete)
+    return file, complete, found, folders
 
 
 class _Builder:

@@ -207,8 +207,7 @@ def doubt_of(scene: Scene, electrode: tuple[str, Array], share: float, reason: s
     far = f", {1e3 * max(near[what], 0.0):.2g} mm away," if near else ""
     return (
         f"the estimated error of electrode {name} is {share:.0%} of what {what}{far} changes"
-        f'{reason and ": " + reason}; move it away, or take preset "fine". '
-        "Further warnings are suppressed; reading.stats.solver_error has the estimate"
+        f'{reason and ": " + reason}; move it away, or take preset "fine"'
     )
 
 

@@ -126,7 +126,7 @@ class Pose(Frozen):
                 f"{deviation:.2g}, det = {np.linalg.det(r):.3g}); scale the shape, not the pose"
             )
         position = m[:3, 3] if m.shape == (4, 4) else (0.0, 0.0, 0.0)
-        return cls(position, _matrix_to_quaternion(r))
+        return cls(position, matrix_to_quaternion(r))
 
     @classmethod
     def from_mujoco(cls, position: Sequence[float] | Array, orientation: ArrayLike) -> Pose:
@@ -242,7 +242,7 @@ class Pose(Frozen):
         )
 
 
-def _matrix_to_quaternion(r: Array) -> Vec4:
+def matrix_to_quaternion(r: Array) -> Vec4:
     """Return the quaternion (x, y, z, w) of a rotation matrix, by Shepperd's method.
 
     The largest of the four components is found first, so nothing is divided by a small number.

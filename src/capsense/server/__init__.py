@@ -2,6 +2,7 @@
 
 - :mod:`~capsense.server.binary`: binary messages
 - :mod:`~capsense.server.messages`: control messages, JSON
+- :mod:`~capsense.server.hands`: hands that a client tracks
 - :mod:`~capsense.server.sensor`: one sensor of one client
 - :mod:`~capsense.server.connection`: the connection of a client, which bounds what it can do
 - :mod:`~capsense.server.session`: one client

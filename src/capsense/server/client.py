@@ -290,6 +290,25 @@ class RemoteSensor:
         more = {"forces": dict(forces)} if forces else {}
         return self._control("poses", time, poses=dict(poses), **more)
 
+    def step_hands(
+        self, joints: Mapping[str, ArrayLike | None], time: float, **options: Any
+    ) -> ReadingMessage:
+        """Send the joints of tracked hands and wait for the reading; the server has the model.
+
+        Args:
+            joints: Side (``"left"``, ``"right"``) to positions in the sensor frame, in the order
+                and unit of the convention, shape (k, 3), NaN for joints that were not seen; None
+                for a hand that was not.
+            time: [s]; later than that of the hands before.
+            options: Of each hand: ``convention``, ``confidence``, ``tip``, ``radii``, ``wrist``, as
+                in the protocol's ``hands``.
+
+        Raises:
+            ProtocolError: The server answered an error.
+        """
+        hands = [{"side": side, "joints": _listed(j), **options} for side, j in joints.items()]
+        return self._control("hands", time, hands=hands)
+
     def send(self, depth: ArrayLike, eps_r: ArrayLike | None = None, time: float = 0.0) -> int:
         """Send a depth image, as :meth:`step` does, but do not wait; returns its number."""
         self.client.send(pack_depth(self.number, self.sequence, time, depth, eps_r))
@@ -314,6 +333,14 @@ class RemoteSensor:
         message = {"type": kind, "sensor": self.number, "sequence": sequence, "time": time}
         self.client.send(json.dumps({**message, **content}))
         return self.client.reading(self.number, sequence)
+
+
+def _listed(joints: ArrayLike | None) -> list[list[float] | None] | None:
+    """Positions as JSON has them: null for what is not finite."""
+    if joints is None:
+        return None
+    rows = np.asarray(joints, dtype=float).reshape(-1, 3)
+    return [row.tolist() if np.isfinite(row).all() else None for row in rows]
 
 
 def _closed(error: Any) -> ProtocolError:

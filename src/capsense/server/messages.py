@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NoReturn, cast
 
+import numpy as np
+
 from capsense import _validate
+from capsense._validate import as_number
 from capsense.errors import (
     CapSenseError,
     DesignError,
@@ -19,6 +23,9 @@ from capsense.errors import (
     SceneError,
     SolveError,
 )
+from capsense.humans import Build
+from capsense.humans.limb import Side
+from capsense.humans.tracking import CONVENTIONS, as_joints
 from capsense.scenario import (
     MAX_FORCE,
     ScenarioTable,
@@ -31,6 +38,7 @@ from capsense.scene import Body, DepthFrame, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.materials import Grounding
 from capsense.server.binary import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
+from capsense.server.hands import HandOptions, HandsMessage, SeenHand
 
 MAX_TEXT = 65536
 """Largest control message [bytes]."""
@@ -88,6 +96,8 @@ class Open:
     back: Literal["fill"] | float
     touch: bool = False
     """Whether readings are to hold what is pressed onto a cover."""
+    hands: HandOptions = field(default_factory=HandOptions)
+    """Of hands that the client tracks."""
     table: Mapping[str, Any] = field(default_factory=dict, compare=False)
     """The message itself."""
 
@@ -185,7 +195,9 @@ def read_open(table: MessageTable) -> Open:
         ProtocolError: A key, type or number is wrong.
         CapSenseError: A camera, material or grounding is wrong.
     """
-    table.only(("type", "sensor", "design", "camera", "material", "grounding", "back", "touch"))
+    table.only(
+        ("type", "sensor", "design", "camera", "material", "grounding", "back", "touch", "hands")
+    )
     options = ScenarioTable(table.data, "message", "open")
     back: Literal["fill"] | float = "fill"
     if table.data.get("back", "fill") != "fill":
@@ -193,8 +205,30 @@ def read_open(table: MessageTable) -> Open:
     camera = _read_camera(MessageTable(table.data.get("camera", {}), "message", "camera"))
     return Open(
         _sensor(table), table.text("design"), camera, read_material(options, "steel"),
-        read_grounding(options), back, table.boolean("touch", False), table.data,
+        read_grounding(options), back, table.boolean("touch", False),
+        _read_hand_options(MessageTable(table.data.get("hands", {}), "message", "hands")),
+        table.data,
     )  # fmt: skip
+
+
+def _read_hand_options(table: MessageTable) -> HandOptions:
+    table.only(("build", "filter"))
+    build = MessageTable(table.data.get("build", {}), "message", "hands: build")
+    build.only(("sex", "stature", "percentile", "girth"))
+    filters = MessageTable(table.data.get("filter", {}), "message", "hands: filter")
+    gaps = ("hold", "fade", "retreat", "min_confidence")
+    filters.only((*_SMOOTH, *gaps))
+    options = HandOptions(
+        Build(**build.data),
+        {k: filters.number(k, 0.0, 1e6) for k in _SMOOTH if k in filters},
+        {k: filters.data[k] for k in gaps if k in filters},
+    )
+    options.make_filter()  # so that what is wrong is refused now
+    return options
+
+
+_SMOOTH = ("min_cutoff", "beta", "derivative_cutoff")
+"""What may be said of the smoothing of hands."""
 
 
 def read_watch(table: MessageTable) -> Watch:
@@ -269,6 +303,48 @@ def read_poses(table: MessageTable, max_bodies: int) -> PosesMessage:
         for name, value in given.data.items()
     }
     return PosesMessage(*_address(table), poses, forces)
+
+
+def read_hands(table: MessageTable) -> HandsMessage:
+    """Read a ``hands``.
+
+    Raises:
+        ProtocolError: A key, type or number is wrong, or a side is there twice.
+        SceneError: Joints are of another number than their convention has.
+    """
+    table.only(("type", "sensor", "sequence", "time", "hands"))
+    table.raw("time", "seconds")
+    table.raw("hands", '[{"side": "right", "joints": [[x, y, z], …]}]')
+    raw = table.tables("hands")
+    if len(raw) > len(_SIDES):
+        raise ProtocolError(f"{len(raw)} hands; there are two sides", "limit")
+    hands = [_read_hand(MessageTable(hand, "message", "hands")) for hand in raw]
+    if len({hand.side for hand in hands}) < len(hands):
+        raise table.error(f"two {hands[0].side} hands; one must be the other")
+    return HandsMessage(*_address(table), tuple(hands))
+
+
+_SIDES = ("left", "right")
+
+
+def _read_hand(table: MessageTable) -> SeenHand:
+    table.only(("side", "convention", "tip", "joints", "radii", "wrist", "confidence"))
+    side = cast("Side", table.choice("side", _SIDES))
+    name = table.choice("convention", tuple(CONVENTIONS), "openxr")
+    count = CONVENTIONS[name].count
+    tip: Any = table.choice("tip", ("skin", "inside")) if "tip" in table else None
+    joints = table.data.get("joints")
+    radii = table.data.get("radii")
+    if radii is not None:
+        if not isinstance(radii, list) or len(radii) != count:
+            raise table.error(f"radii must be {count} numbers or null, those of {name}")
+        radii = np.array([math.nan if r is None else as_number(r) for r in radii])
+    return SeenHand(
+        side, name, tip,
+        None if joints is None else as_joints(joints, count, f"joints ({name})"), radii,
+        table.coordinates("wrist", (3,)) if "wrist" in table else None,
+        table.number("confidence", 0.0, 1.0, 1.0),
+    )  # fmt: skip
 
 
 def read_sensor(table: MessageTable) -> int:

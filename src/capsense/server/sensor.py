@@ -24,6 +24,7 @@ from capsense.server.binary import (
     pack_depth,
     pack_reading,
 )
+from capsense.server.hands import HandsMessage, ServedHands
 from capsense.server.messages import BodiesMessage, Open, PosesMessage
 from capsense.simulator import Simulator
 
@@ -72,9 +73,16 @@ class ServedSensor:
         self._bodies: dict[str, Body] = {}
         self._tables: tuple[Mapping[str, Any], ...] = ()
         self._time: float | None = None
+        said = {k: v for k, v in options.table.items() if k in ("material", "grounding")}
+        self.hands = ServedHands(
+            options.hands, options.material, options.grounding, {"material": "steel", **said}
+        )
+        """What the client tracks; frames of shapes hold them too."""
 
-    def offer(self, frame: Frame | PosesMessage) -> None:
+    def offer(self, frame: Frame | PosesMessage | HandsMessage) -> None:
         """Take a frame in; one that still waits is dropped for it.
+
+        Of tracked hands, :attr:`hands` must have been updated before.
 
         Raises:
             ProtocolError: Its number does not exceed the one before, or it moves an unknown body.
@@ -91,6 +99,11 @@ class ServedSensor:
         if isinstance(frame, BodiesMessage):
             self._bodies = {str(b.name): b for b in frame.bodies}
             self._tables = frame.tables
+        if not isinstance(frame, DepthMessage):
+            frame = BodiesMessage(
+                frame.sensor, frame.sequence, frame.time,
+                (*self._bodies.values(), *self.hands.bodies), (*self._tables, *self.hands.tables),
+            )  # fmt: skip
         self.frames += 1
         self.drop()
         self._waiting = frame
@@ -107,6 +120,7 @@ class ServedSensor:
     def restart(self) -> None:
         """Forget everything but the bodies; the lock must be held."""
         self.drop()
+        self.hands.reset()
         self._last, self._time = -1, None
         self.simulator.reset()
 

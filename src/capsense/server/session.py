@@ -93,7 +93,7 @@ class ClientSession:
         self._handlers: dict[str, Callable[[messages.MessageTable], Any]] = {
             "open": self._open, "close": self._close, "reset": self._reset, "watch": self._watch,
             "scene": partial(self._frame, messages.read_scene),
-            "poses": partial(self._frame, messages.read_poses),
+            "poses": partial(self._frame, messages.read_poses), "hands": self._hands,
         }  # fmt: skip
 
     async def run(self) -> None:
@@ -164,7 +164,7 @@ class ClientSession:
         await self._tell(
             "welcome", protocol=PROTOCOL, server=f"capsense {self._server.version}",
             designs=self._server.design_names,
-            limits={name: getattr(self._limits, name) for name in told}, touch=True,
+            limits={name: getattr(self._limits, name) for name in told}, touch=True, hands=True,
         )  # fmt: skip
 
     async def _pace(self, cost: float) -> None:
@@ -260,6 +260,13 @@ class ClientSession:
     ) -> None:  # fmt: skip
         frame = await self._server.work(lambda: read(table, self._limits.bodies))
         self._sensor(frame.sensor).offer(frame)
+        self._wake.set()
+
+    async def _hands(self, table: messages.MessageTable) -> None:
+        frame = await self._server.work(lambda: messages.read_hands(table))
+        sensor = self._sensor(frame.sensor)
+        await self._server.work(lambda: sensor.hands.update(frame))
+        sensor.offer(frame)
         self._wake.set()
 
     def _sensor(self, number: int) -> ServedSensor:

@@ -18,7 +18,7 @@ from capsense.errors import CapSenseError, SceneError, SkinError
 from capsense.reading import Reading
 from capsense.readout import SEED_STRIDE, Readout
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Doubt, Simulator, check_view, read_together
+from capsense.simulator import ONCE, Doubt, Simulator, check_view, read_together
 
 Array = NDArray[np.float64]
 AnyDesign = Design | str | Path | Simulator
@@ -182,7 +182,9 @@ class Skin:
         return Scene([body.moved(inverse @ body.pose) for body in bodies])
 
 
-def make_simulators(designs: Mapping[str, AnyDesign]) -> dict[str, Simulator]:
+def make_simulators(
+    designs: Mapping[str, AnyDesign], progress: Callable[[str, float], None] | None = None
+) -> dict[str, Simulator]:
     """Simulators by name; where the same design comes again, one that shares its field.
 
     A simulator that is given is used once, and copies of it after that.
@@ -205,7 +207,7 @@ def make_simulators(designs: Mapping[str, AnyDesign]) -> dict[str, Simulator]:
                 seed = chip.seed + (len(simulators) - 1) * SEED_STRIDE
                 made.use_readout(copy.deepcopy(chip), seed=seed)
             continue
-        made = design if isinstance(design, Simulator) else Simulator(design)
+        made = design if isinstance(design, Simulator) else Simulator(design, progress=progress)
         simulators[name] = first[key] = made
     return simulators
 
@@ -315,6 +317,6 @@ def _warn_of_doubts(doubts: Mapping[str, Doubt], count: int) -> None:
     worst = max(doubts, key=lambda name: doubts[name].share)
     warnings.warn(
         f"{len(doubts)} of {count} sensors have large estimated errors; the worst is {worst!r}: "
-        f"{doubts[worst].text}",
+        f"{doubts[worst].text}. {ONCE}",
         stacklevel=4,
     )

@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 LATE = 0.25
 """A player that is this late [s] does not try to make up for it."""
 FIELD_PERIOD = 0.1
-"""While time runs, potentials are taken no more often [s]."""
+"""While time runs, potentials are taken no more often [s]; nor sooner than after as long as they
+took, so that whatever else the program does has half of a processor."""
 KEPT = 3000
 """A follower keeps at least so many samples, and up to twice as many."""
 WAIT = 0.05
@@ -318,7 +319,8 @@ class Follower(_Playing):
         if not taken and now - self._field_taken >= FIELD_PERIOD:
             found = self.source.potentials(frame, plane)
             self.with_field = replace(frame, plane=plane, potentials=found)
-            self._field_taken = now
+            done = time.monotonic()
+            self._field_taken = max(now, 2.0 * done - now - FIELD_PERIOD)
 
 
 Playback = Player | Follower

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
     from viser import ViserServer
+
+    from capsense.viewer.source import Frame
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -41,26 +43,74 @@ SPOTS, DOT = 6000, 1.2e-3
 _FACETED = (ShapeKind.BOX, ShapeKind.CYLINDER, ShapeKind.MESH)
 
 
-class SceneDrawing:
+class _Below:
+    """A scene of viser, in which all that is added stands below a frame."""
+
+    def __init__(self, scene: Any, root: str) -> None:
+        self._scene, self._root = scene, root
+
+    def __getattr__(self, method: str) -> Any:
+        call = getattr(self._scene, method)
+        return lambda name, *args, **options: call(self._root + name, *args, **options)
+
+
+class _Robot:
+    """Draws the solids of a robot's simulator.
+
+    Args:
+        scene: A scene of viser.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        self._scene = scene
+        self._around: list[tuple[Shape, Any]] = []
+
+    def show_around(self, solids: Sequence[tuple[Shape, Pose]]) -> None:
+        """Put a robot's solids where they stand; those of other shapes are made anew."""
+        if [id(shape) for shape, _ in solids] != [id(shape) for shape, _ in self._around]:
+            for _, handle in self._around:
+                handle.remove()
+            self._around = [
+                (shape, self._solid(f"/robot/{k}", shape, CONDUCTIVE, side="double"))
+                for k, (shape, _) in enumerate(solids)
+            ]
+        for (_, pose), (_, handle) in zip(solids, self._around, strict=True):
+            _put(handle, pose)
+
+    def _solid(self, name: str, shape: Shape, colour: Colour, **options: Any) -> Any:
+        mesh = shape.to_trimesh()
+        flat = shape.kind in _FACETED
+        return self._mesh(name, mesh.vertices, mesh.faces, colour, flat_shading=flat, **options)
+
+    def _mesh(self, name: str, vertices: Any, faces: Any, colour: Any, **options: Any) -> Any:
+        return self._scene.add_mesh_simple(
+            name, vertices, faces, color=colour, cast_shadow=False, receive_shadow=False, **options
+        )
+
+
+class SceneDrawing(_Robot):
     """Draws into a server; lengths are metres in the sensor frame.
 
     Args:
         server: Shows it to all who are connected.
         design: The sensor.
+        root: The frame of the sensor, where it is one of several: it is drawn without its domain,
+            names and scales.
     """
 
-    def __init__(self, server: ViserServer, design: Design) -> None:
-        self._scene = server.scene
+    def __init__(self, server: ViserServer, design: Design, root: str = "") -> None:
+        super().__init__(_Below(server.scene, root) if root else server.scene)
         self._bodies: list[tuple[Any, ...]] = []
         self._spots: list[Array] = []
-        self._around: list[tuple[Shape, Any]] = []
         self._shades = np.full(len(design.electrodes), -1)
         self._plates: dict[tuple[int, int], Any] = {}
         self._surfaces = [e.surface for e in design.electrodes]
         server.scene.configure_default_lights(cast_shadow=False)
-        self._draw_domain(design)
         self._draw_stack(design)
         self.show_signals(np.zeros(len(design.electrodes)))
+        if root:
+            return
+        self._draw_domain(design)
         self._draw_scale(design)
         if len(design.electrodes) <= MAX_LABELS:
             for k, e in enumerate(design.electrodes):
@@ -68,11 +118,18 @@ class SceneDrawing:
         low, high = np.array([e.surface.bounds for e in design.electrodes]).transpose(1, 0, 2)
         middle = (low.min(axis=0) + high.max(axis=0)) / 2
         reach = max(0.08, float(np.ptp([low.min(axis=0), high.max(axis=0)], axis=0).max()))
-        camera = server.initial_camera
-        camera.near, camera.far = 1e-3, 20.0
-        camera.look_at = middle + np.array([0.0, 0.0, 0.4 * reach])
-        camera.position = middle + reach * np.array([1.3, -3.0, 1.7])
-        camera.fov = 0.8
+        _look_at(server, middle, reach)
+
+    def show(self, frame: Frame, loudest: float) -> None:
+        """Put bodies and the robot where they stand, and colour the electrodes.
+
+        Args:
+            frame: What is shown.
+            loudest: Change of an electrode that colours it fully [F].
+        """
+        self.show_bodies(Scene() if frame.around else frame.scene)
+        self.show_around(frame.around)
+        self.show_signals(np.abs(np.diag(frame.reading.delta)) / loudest)
 
     def show_signals(self, strength: Array) -> None:
         """Colour the electrodes by their signals, 0 to 1, shape (M,)."""
@@ -105,23 +162,12 @@ class SceneDrawing:
         if not same:
             for handle in [h for _, *handles in self._bodies for h in handles]:
                 handle.remove()
-            self._bodies = [self._named(k, b) for k, b in enumerate(bodies)]
+            labels = _labels(bodies)
+            self._bodies = [self._named(k, b, labels.get(k)) for k, b in enumerate(bodies)]
             self._spots = [spots_of(b) for b in bodies]
         for body, (_, *handles) in zip(bodies, self._bodies, strict=True):
             for handle in handles:
                 _put(handle, body.pose)
-
-    def show_around(self, solids: Sequence[tuple[Shape, Pose]]) -> None:
-        """Put a robot's solids where they stand; those of other shapes are made anew."""
-        if [id(shape) for shape, _ in solids] != [id(shape) for shape, _ in self._around]:
-            for _, handle in self._around:
-                handle.remove()
-            self._around = [
-                (shape, self._solid(f"/robot/{k}", shape, CONDUCTIVE, side="double"))
-                for k, (shape, _) in enumerate(solids)
-            ]
-        for (_, pose), (_, handle) in zip(solids, self._around, strict=True):
-            _put(handle, pose)
 
     def show_plane(self, plane: Plane, potential: Array) -> None:
         """Draw lines of the potential at a plane's points [V], shape (n,)."""
@@ -184,8 +230,8 @@ class SceneDrawing:
         faces = np.arange(len(corners)).reshape(-1, 3)
         self._mesh(name, corners, faces, colour, flat_shading=True, side="double")
 
-    def _named(self, number: int, body: Body) -> tuple[Any, ...]:
-        """A body, what is drawn of it, and its name, if it has one and there are not too many."""
+    def _named(self, number: int, body: Body, label: str | None) -> tuple[Any, ...]:
+        """A body, what is drawn of it, and its label, if it has one."""
         name, shape = f"/bodies/{number}", body.shape
         colour = CONDUCTIVE if body.material.is_conductor() else DIELECTRIC
         if isinstance(shape, Layers):
@@ -193,18 +239,10 @@ class SceneDrawing:
         else:
             side = "double" if shape.kind == ShapeKind.SURFACE else "front"
             drawn = self._solid(name, shape, colour, side=side, opacity=0.4)
-        if body.name is None or number >= MAX_LABELS:
-            return body, drawn
-        return body, drawn, self._label(f"/names/{number}", body.name)
-
-    def _solid(self, name: str, shape: Shape, colour: Colour, **options: Any) -> Any:
-        mesh = shape.to_trimesh()
-        flat = shape.kind in _FACETED
-        return self._mesh(name, mesh.vertices, mesh.faces, colour, flat_shading=flat, **options)
-
-    def _mesh(self, name: str, vertices: Any, faces: Any, colour: Any, **options: Any) -> Any:
-        return self._scene.add_mesh_simple(
-            name, vertices, faces, color=colour, cast_shadow=False, receive_shadow=False, **options
+        return (
+            (body, drawn)
+            if label is None
+            else (body, drawn, self._label(f"/names/{number}", label))
         )
 
     def _label(self, name: str, text: str, position: Any = (0.0, 0.0, 0.0), **options: Any) -> Any:
@@ -241,6 +279,60 @@ class SceneDrawing:
             name, points, colour, point_size=0.2 * min(width, height), point_shape="circle",
             point_shading="flat",
         )  # fmt: skip
+
+
+def _labels(bodies: Sequence[Body]) -> dict[int, str]:
+    """What is written at which bodies: their names; of one conductor, its name at the first."""
+    first: dict[str, int] = {}
+    found = {}
+    for k, body in enumerate(bodies[:MAX_LABELS]):
+        label = body.conductor or body.name
+        if label is not None and (body.conductor is None or first.setdefault(label, k) == k):
+            found[k] = label
+    return found
+
+
+class SkinDrawing:
+    """Draws all sensors of a skin; lengths are metres in the frame of the world.
+
+    Args:
+        server: Shows it to all who are connected.
+        designs: Name → sensor.
+        middles: Where they stand at first [m], shape (s, 3).
+    """
+
+    def __init__(self, server: ViserServer, designs: Mapping[str, Design], middles: Array) -> None:
+        self._frames = {
+            name: server.scene.add_frame(f"/skin/{k}", show_axes=False)
+            for k, name in enumerate(designs)
+        }
+        self._parts = [
+            SceneDrawing(server, design, f"/skin/{k}") for k, design in enumerate(designs.values())
+        ]
+        self._robot = _Robot(server.scene)
+        low, high = middles.min(axis=0), middles.max(axis=0)
+        _look_at(server, 0.5 * (low + high), max(0.15, 0.6 * float(np.linalg.norm(high - low))))
+
+    def show(self, frame: Frame, loudest: float) -> None:
+        """Put the sensors and the robot where they stand, and colour the electrodes.
+
+        Args:
+            frame: What is shown; it holds a skin.
+            loudest: Change of an electrode that colours it fully [F].
+        """
+        self._robot.show_around(frame.around)
+        for part, (name, (pose, changes)) in zip(self._parts, frame.skin.items(), strict=True):
+            _put(self._frames[name], pose)
+            part.show_signals(changes / loudest)
+
+
+def _look_at(server: ViserServer, middle: Array, reach: float) -> None:
+    """Let those who come look at a place [m] with so much around it [m]."""
+    camera = server.initial_camera
+    camera.near, camera.far = 1e-3, 20.0
+    camera.look_at = middle + np.array([0.0, 0.0, 0.4 * reach])
+    camera.position = middle + reach * np.array([1.3, -3.0, 1.7])
+    camera.fov = 0.8
 
 
 def _put(handle: Any, pose: Pose) -> None:

@@ -6,7 +6,7 @@ import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,8 @@ from capsense.simulator import Simulator
 from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
+    from viser import ViserServer
+
     from capsense.recording.reader import Recording
 
 
@@ -50,7 +52,10 @@ class Frame:
     """On the bodies, where potentials were asked for."""
     around: tuple[tuple[Shape, Pose], ...] = ()
     """All solids of the robot's simulator in the sensor frame, where there is one; drawn in place
-    of the bodies."""
+    of the bodies. Of a skin, in the frame of the world."""
+    skin: Mapping[str, tuple[Pose, Array]] = field(default_factory=dict)
+    """Of a skin, name → where the sensor stands in the world, and changes of its electrodes' own
+    capacitances [F]."""
 
 
 class Source:
@@ -71,6 +76,12 @@ class Source:
         self.green = simulator.background.green if simulator.method == "surface" else None
         """Of the sensor, where potentials can be had; None where they cannot."""
         self._simulator = simulator
+
+    def stage(self, server: ViserServer) -> Any:
+        """What draws its instants into a server."""
+        from capsense.viewer.scene_drawing import SceneDrawing
+
+        return SceneDrawing(server, self.design)
 
     def potentials(self, frame: Frame, plane: Plane) -> Array:
         """Potentials of an instant at a plane's points [V], shape (n, terminals).

@@ -19,10 +19,8 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from capsense.errors import MissingDependencyError, ServerError
-from capsense.scene import Scene
 from capsense.viewer.charts import PlaneControls, heat_map, make_charts, strip, touch_table
 from capsense.viewer.player import Playback, Player
-from capsense.viewer.scene_drawing import SceneDrawing
 
 try:
     from viser import ViserServer
@@ -200,7 +198,7 @@ class LiveView:
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label("capsense")
         gui.main_panel.dock_right()
-        self._stage = SceneDrawing(self.server, source.design)
+        self._stage = source.stage(self.server)
         self.status = gui.add_html("")
         """The line of text about what is shown."""
         self.time = TimeControls(gui, player)
@@ -240,8 +238,6 @@ class LiveView:
             self._drawn = state
             with self.server.atomic():
                 self.time.show(frame)
-                self._stage.show_bodies(Scene() if frame.around else frame.scene)
-                self._stage.show_around(frame.around)
                 times, changes = player.history(frame.index)
                 window = strip(times, changes)
                 for chart in self._charts:
@@ -250,7 +246,7 @@ class LiveView:
                 before = np.abs(changes[:, self._own]).max(initial=0.0)
                 self._loudest = max(self._loudest, float(own.max()), float(before))
                 self.status.content = status(player, frame, self._loudest)
-                self._stage.show_signals(own / self._loudest)
+                self._stage.show(frame, self._loudest)
                 self._matrix.content = heat_map(frame.reading.electrode_names, frame.reading.delta)
                 if self._touch is not None and frame.reading.touch is not None:
                     names, (table, limit) = frame.reading.electrode_names, self._touch

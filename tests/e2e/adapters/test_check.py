@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import warnings
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from adapter_worlds import Thing
 
 import capsense as cs
 from capsense.adapters.placement import placement
+from capsense.solver.tree import shape_cache
 
 SensorIn = Callable[..., Any]
 BALL = cs.Sphere(0.02)
@@ -157,6 +159,44 @@ def test_markers_are_told(tiny_simulator: cs.Simulator) -> None:
     assert not any("markers" in text for text in clean.check())
 
 
+def test_markers_in_pybullet(tiny_simulator: cs.Simulator) -> None:
+    """A goal that is only drawn, and can be seen through; another one that cannot."""
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    client = p.connect(p.DIRECT)
+    pad = p.createMultiBody(0, physicsClientId=client)
+    for alpha, place in ((0.3, (0, 0, 0.05)), (1.0, (0.03, 0, 0.05))):
+        ball = p.createVisualShape(
+            p.GEOM_SPHERE, radius=0.01, rgbaColor=(1, 0, 0, alpha), physicsClientId=client
+        )
+        p.createMultiBody(0, -1, ball, place, physicsClientId=client)
+    with pytest.warns(UserWarning, match="as markers do"):
+        sensor = cs.pybullet.attach(client, pad, -1, cs.Pose(), tiny_simulator)
+    (found,) = sensor.check().mounting
+    assert re.match(r"'body1/\w*' can be seen through .* with exclude=\['body1/\w*'\]$", found)
+    assert len(sensor.scene()) == 2
+    p.disconnect(client)
+
+
+def test_a_sensor_that_faces_out_of_its_link_may_be_mounted_well(
+    tiny_simulator: cs.Simulator,
+) -> None:
+    """On the far side of an arm: there is something on the other side of the arm only."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><geom type="box" size=".02 .02 .01"/>'
+        '<site name="out" pos="0 0 .011"/><site name="in" pos="0 0 .011" quat="0 1 0 0"/></body>'
+        '<body pos="0 0 -.03"><geom name="ball" size=".01"/></body>'
+        '<body pos="0 0 .05"><geom name="other" size=".01"/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for site, exclude, told in (("out", ["other"], False), ("in", ["ball"], True)):
+        found = cs.mujoco.attach(model, data, site, tiny_simulator, exclude=exclude).check()
+        assert len(found) == 1
+        assert "faced the other way" in found[0]
+        assert bool(found.mounting) == told
+
+
 @pytest.mark.parametrize(("height", "told"), [(0.05, False), (0.041, False), (0.02, True)])
 def test_electrodes_within_their_own_link(
     height: float, told: bool, tiny_simulator: cs.Simulator
@@ -262,8 +302,16 @@ def test_a_reading_that_the_solver_itself_doubts_is_told(tiny_simulator: cs.Simu
     rough = replace(reading, stats=replace(reading.stats, solver_error=0.6 * largest))
     sensor.simulator.solved_batch = lambda scenes, threads: [rough]  # type: ignore[method-assign]
     (found,) = sensor.check()
-    assert f"changes by {1e15 * largest:.2g} fF" in found
-    assert f"an error of {0.6e15 * largest:.2g} fF" in found
+    assert found.startswith("the estimated error of electrode A is 60% of what ball, 21 mm away")
+    assert found.kind == "rough"
+    sensor.simulator.solved_batch = cs.Simulator.solved_batch.__get__(sensor.simulator)  # type: ignore[method-assign]
+    words = re.escape(found.partition(";")[0])
+    with pytest.warns(UserWarning, match=words):  # in the words of the reading itself
+        sensor.simulator._of(
+            replace(sensor.simulator._solver.solve(sensor.scene()), error=0.6 * largest, loss=None),
+            sensor.scene(),
+            0.0,
+        )
 
 
 def test_a_mesh_too_large_for_its_panels(tiny_simulator: cs.Simulator) -> None:
@@ -322,10 +370,131 @@ def test_a_skin_warns_where_all_are_blind(tiny_simulator: cs.Simulator) -> None:
         warnings.simplefilter("error")
         skin = attach(0.04)
     assert [len(found) for found in skin.check().values()] == [0, 1]
-    with pytest.warns(UserWarning, match="^sensor 'near': electrodes 'A', 'B' lie inside"):
+    with pytest.warns(UserWarning, match="^scene: sensor 'near': electrodes 'A', 'B' lie inside"):
         attach(0.0)
     with pytest.warns(UserWarning, match="sensor 'near' and 1 more: nothing is in view"):
         attach(5.0)
+
+
+def two_links(ball: str, extra: str = "") -> Any:
+    """A robot whose second link is turned onto the pad on the first; a ball beside it."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option gravity="0 0 0"/><worldbody>
+      <body name="one"><joint axis="0 0 1"/><geom name="one" type="box" size=".03 .03 .01"
+        pos="0 0 -.0101" mass="100"/><site name="pad"/><site name="high" pos="0 0 .004"/>
+        <body name="two" pos=".1 0 0"><joint name="fold" axis="0 1 0" range="-3.2 3.2"/>
+          <geom name="two" type="box" size=".05 .01 .005" pos="-.05 0 .05" contype="0"
+            conaffinity="0"/>
+          <body name="three" pos="0 0 1"><joint/><geom name="three" size=".01"/></body></body>
+      </body><body name="ball" {ball}><geom name="ball" size=".02"/></body>{extra}
+      </worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def test_mounting_is_told_apart_from_the_scene(tiny_simulator: cs.Simulator) -> None:
+    """Another link of the sensor's own robot stays there; a ball goes."""
+    model, data = two_links('mocap="true" pos="0 0 .05"')
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
+    assert str(sensor.check()) == "nothing is wrong"
+    data.mocap_pos[0] = 0, 0, 0.01
+    two = model.geom("two").id
+    model.geom_pos[two] = -0.1, 0, 0.0
+    mujoco = pytest.importorskip("mujoco")
+    mujoco.mj_forward(model, data)
+    found = sensor.check()
+    (link,), (ball,) = found.mounting, found.scene
+    assert re.match(r".*inside 'two/two', up to 5 mm deep.*move the sensor's frame", link)
+    assert re.match(
+        r".*inside 'ball/ball', up to [89]\.\d mm deep.*until they part; move one of", ball
+    )
+    assert list(found) == [link, ball]
+    assert str(found) == f"mounting: {link};\nscene: {ball}"
+    assert sensor.source.neighbours(1) == {1, 2}
+
+
+def test_contact_is_no_collision(tiny_simulator: cs.Simulator) -> None:
+    """The simulator's overlap of a ball that is pressed onto the pad; deeper, it is a collision."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model, data = two_links('pos="-.01 0 .0195" mocap="true"')
+    sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
+    (found,) = sensor.check()
+    assert re.match(r".*in contact with 'ball/ball', which .* overlap by up to 0\.49 mm", found)
+    assert "move" not in found
+    assert sensor.check().mounting == []
+    data.mocap_pos[0, 2] = 0.01
+    model.geom_conaffinity[model.geom("ball").id] = model.geom_contype[model.geom("ball").id] = 0
+    mujoco.mj_forward(model, data)
+    (found,) = sensor.check()
+    assert "lie inside 'ball/ball'" in found
+
+
+@pytest.mark.parametrize(("material", "gap", "told"), [
+    ("steel", -1e-6, True), ("steel", 1.9e-4, False), ("wood", 1e-6, False), ("wood", -1e-3, True),
+])  # fmt: skip
+def test_what_touches_is_what_readings_warn_of(
+    material: str, gap: float, told: bool, tiny_simulator: cs.Simulator
+) -> None:
+    """Differential: nothing is told of what the reading takes without a warning."""
+    body = cs.Body(BALL, cs.Pose((-0.01, 0, 0.02 + gap)), material, name="ball")
+    found = placement(cs.Scene([body]), tiny_simulator)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tiny_simulator.copy().step(cs.Scene([body]))
+    warned = any("readings mean nothing" in str(w.message) for w in caught)
+    assert (bool(found), warned) == (told, told)
+
+
+def test_findings_of_many_sensors_are_one_sentence(tiny_simulator: cs.Simulator) -> None:
+    """With the worst of them."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model, data = two_links('mocap="true" pos="0 0 .022"')
+    told: list[tuple[str, float]] = []
+    skin = cs.mujoco.attach_skin(
+        model, data, ["pad", "high"], tiny_simulator, progress=lambda *x: told.append(x)
+    )
+    parts = [fraction for stage, fraction in told if stage == "shapes that sensors see"]
+    assert parts == [0.0, 0.5, 1.0]
+    data.mocap_pos[0, 2] = 0.015
+    mujoco.mj_forward(model, data)
+    found = skin.check()
+    (text,) = found.scene
+    assert re.match(
+        r"2 of 2 sensors, 'high', 'pad'; the worst, 'high': electrodes .* 7\.9 mm", text
+    )
+    assert found.mounting == []
+    assert str(found) == f"scene: {text}"
+    assert pickle.loads(pickle.dumps(found)) == found
+    assert pickle.loads(pickle.dumps(found)).scene == [text]
+
+
+def test_what_was_worked_out_survives_an_interruption(
+    tiny_simulator: cs.Simulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user loses patience after the first of two sensors."""
+    model, data = two_links('mocap="true" pos="0 0 .0731"')
+    model.geom_size[model.geom("ball").id] = 0.0471  # a size that no other test has
+    made: list[str] = []
+    before = shape_cache.rigid_shape
+
+    def rigid_shape(panels: Any, **options: Any) -> Any:
+        made.append("one")
+        return before(panels, **options)
+
+    monkeypatch.setattr(shape_cache, "rigid_shape", rigid_shape)
+
+    def impatient(stage: str, fraction: float) -> None:
+        if fraction >= 0.5 and stage.startswith("shapes"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cs.mujoco.attach_skin(model, data, ["pad", "high"], tiny_simulator, progress=impatient)
+    first = len(made)
+    cs.mujoco.attach_skin(model, data, ["pad", "high"], tiny_simulator)
+    assert len(made) == first
 
 
 def test_farads_are_not_picofarads() -> None:

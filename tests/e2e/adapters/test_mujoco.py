@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,8 @@ from approximate import approx
 
 import capsense as cs
 from capsense.adapters.meshes import Terrain, height_field
+from capsense.adapters.mujoco_model import ModelSource
+from capsense.adapters.rules import Rules
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
@@ -361,11 +362,11 @@ def test_example_models_load(tmp_path: Path, tiny_simulator: cs.Simulator) -> No
     assert corners.max(axis=0) == approx(box.bounds[1], abs=1e-7)
 
 
-@pytest.mark.parametrize(("drawn", "seen", "warned"), [("obj", 14, 1), ("stl", 7, 0)])
+@pytest.mark.parametrize(("drawn", "both"), [("obj", 14), ("stl", 7)])
 def test_a_robot_that_is_drawn_and_collides(
-    drawn: str, seen: int, warned: int, tiny_simulator: cs.Simulator
+    drawn: str, both: int, tiny_simulator: cs.Simulator
 ) -> None:
-    """A KUKA of a URDF: two meshes of one link are told, the same mesh twice is seen once."""
+    """A KUKA of a URDF: of each link what collides is seen; the same mesh twice is seen once."""
     pybullet_data = pytest.importorskip("pybullet_data", reason="PyBullet is not installed")
     folder = Path(pybullet_data.getDataPath()) / "kuka_iiwa"
     text = (folder / "model.urdf").read_text().replace(".obj", f".{drawn}")
@@ -376,16 +377,44 @@ def test_a_robot_that_is_drawn_and_collides(
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
-    twice = [str(w.message) for w in caught if "are seen twice" in str(w.message)]
-    assert len(twice) == warned
-    assert all(r"collide (groups=[0])" in text and r"(groups=[1])" in text for text in twice)
-    assert len(sensor.world.solids) == seen
+    for shapes, groups in (("both", None), ("visual", [1]), ("collision", [0])):
+        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator, shapes=shapes)
+        assert len(sensor.world.solids) == (both if shapes == "both" else 7)
+        assert groups is None or set(model.geom_group[sensor.source.geoms]) == set(groups)
     (found,) = sensor.check()  # the robot behind is no reason to turn the sensor round
     assert "nothing is in view" in found
     assert "faced the other way" not in found
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", "sensor: bodies")
-        cs.mujoco.attach(model, data, "pad", tiny_simulator, groups=[0])
+
+
+def test_what_collides_stands_for_what_is_drawn(tiny_simulator: cs.Simulator) -> None:
+    """Of each body; what nothing that collides stands in for is seen as it is drawn."""
+    text = """<mujoco><default><default class="drawn"><geom contype="0" conaffinity="0" group="2"/>
+      </default></default><worldbody>
+      <geom name="floor" type="plane" size="1 1 1"/><geom name="wall" type="box" size=".1 .1 .1"/>
+      <geom name="wall_drawn" class="drawn" type="box" size=".1 .1 .09" pos="0 0 .001"/>
+      <geom name="shelf" class="drawn" type="box" size=".1 .1 .01" pos="0 0 .5"/>
+      <body name="cup" pos="1 0 1"><geom name="cup" class="drawn" size=".03"/></body>
+      <body name="link" pos="0 1 1"><geom name="hull" type="capsule" size=".05 .1"/>
+        <geom name="shell" class="drawn" type="capsule" size=".049 .1"/>
+        <geom name="cap" class="drawn" size=".04" pos="0 0 .1"/>
+        <geom name="lamp" class="drawn" size=".01" pos="0 0 .5"/></body>
+      <body name="calf" pos="0 2 1"><freejoint/><geom name="foot" class="drawn" size=".02"/>
+        <geom name="shin" class="drawn" type="capsule" size=".02 .1" pos="0 0 .15"/>
+        <geom name="toe" class="drawn" size=".01"/></body>
+      <site name="pad" pos="0 0 3"/></worldbody>
+      <contact><pair geom1="floor" geom2="foot"/></contact></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    names = [model.geom(k).name for k in range(model.ngeom)]
+
+    def seen(**options: Any) -> set[str]:
+        source = ModelSource(model, data, Rules(**options), None)
+        return {names[k] for k in source.geoms}
+
+    assert seen() == set(names) - {"wall_drawn", "shell", "cap", "toe"}
+    assert seen(shapes="both") == set(names)
+    assert seen(shapes="visual") == set(names) - {"wall", "hull", "foot"}
+    only = ModelSource(model, data, Rules(), [2]).geoms  # "foot" collides, the others do not
+    assert {names[k] for k in only} == set(names) - {"floor", "wall", "hull", "toe"}
+    with pytest.raises(ValueError, match="shapes is 'drawn'; choose"):
+        cs.mujoco.attach(model, data, "pad", tiny_simulator, shapes="drawn")

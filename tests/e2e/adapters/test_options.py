@@ -24,7 +24,7 @@ def test_the_rules_are_the_options() -> None:
         ("mujoco", {"material": {}}, "no option 'material'; did you mean 'materials'"),
         ("mujoco", {"preset": "fine"}, r"no option 'preset'.*give design=cs.Simulator\(design, pr"),
         ("mujoco", {"desing": "patch"}, "no option 'desing'; did you mean 'design'"),
-        ("mujoco", {"shapes": "visual"}, "no option 'shapes'.*groups"),
+        ("mujoco", {"shape": "visual"}, "no option 'shape'; did you mean 'shapes'"),
         ("pybullet", {"groups": [1]}, "no option 'groups'.*resolution"),
     ],
 )

@@ -115,6 +115,52 @@ def test_a_urdf_stands_where_its_file_says(
     assert (fore.radius, fore.length) == approx((0.008, 0.02), rel=1e-5)
 
 
+@pytest.mark.parametrize("perception", ["geometry", "depth_camera"])
+def test_a_body_of_too_many_links(
+    perception: Any, client: int, tiny_simulator: cs.Simulator, tmp_path: Path
+) -> None:
+    """PyBullet itself says no more than "getLinkState failed"."""
+    inertia = '<mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    link = '<link name="a{0}"><inertial>{1}</inertial></link>'
+    joint = (
+        '<joint name="j{0}" type="{1}"><parent link="a0"/><child link="a{0}"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    )
+    file = tmp_path / "hairy.urdf"
+    text = "".join(link.format(k, inertia) + "\n" for k in range(130))
+    kinds = ["fixed" if k < 30 else "revolute" for k in range(130)]
+    text += "".join(joint.format(k, kinds[k]) + "\n" for k in range(1, 130))
+    file.write_text(f'<robot name="hairy">\n{text}</robot>')
+    load = {"fileName": str(file), "physicsClientId": client}
+    body = p.loadURDF(**load)
+    fix = r"'hairy', has 129 links beside its base.* 127 at most.*URDF_MERGE_FIXED_LINKS.* 29 fixed"
+    with pytest.raises(cs.SceneError, match=fix):
+        cs.pybullet.attach(client, body, -1, cs.Pose(), tiny_simulator, perception=perception)
+    p.removeBody(body, physicsClientId=client)
+    joined = p.loadURDF(**load, flags=p.URDF_MERGE_FIXED_LINKS)
+    sensor = cs.pybullet.attach(
+        client, joined, -1, cs.Pose(), tiny_simulator, perception=perception
+    )
+    assert not sensor.read().delta.any()
+
+
+def test_a_link_that_is_only_drawn_is_seen(client: int, attach: Callable[..., Any]) -> None:
+    """Also one that only collides, where what is drawn is preferred; and both, if asked."""
+    make = {"radius": 0.01, "physicsClientId": client}
+    drawn = p.createVisualShape(p.GEOM_SPHERE, **make)
+    solid = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.01] * 3, physicsClientId=client)
+    p.createMultiBody(0, -1, drawn, AHEAD, physicsClientId=client)
+    for shapes in ("collision", "visual", "both"):
+        (ball,) = attach(shapes=shapes, exclude=["pad"]).scene()
+        same(ball.shape, cs.Sphere(0.01))
+    p.createMultiBody(0, solid, drawn, (0.03, 0, 0.04), physicsClientId=client)
+    assert [b.shape.kind.name for b in attach(exclude=["pad"]).scene()] == ["SPHERE", "BOX"]
+    kinds = [b.shape.kind.name for b in attach(shapes="both", exclude=["pad"]).scene()]
+    assert kinds == ["SPHERE", "SPHERE", "BOX"]
+    with pytest.raises(ValueError, match="shapes is 'hull'; choose"):
+        attach(shapes="hull")
+
+
 def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
     """All shapes of a compound are seen, each in its place."""
     array = p.createCollisionShapeArray(
@@ -319,7 +365,7 @@ def test_shapes_without_volume_are_left_out(
     shape = {"radius": 0.01, "physicsClientId": client}
     ball = (f(p.GEOM_SPHERE, **shape) for f in (p.createCollisionShape, p.createVisualShape))
     p.createMultiBody(0, *ball, basePosition=AHEAD, physicsClientId=client)
-    with pytest.warns(UserWarning, match=r"sensor: 'robot/robot_link' .*\(left out\)$"):
+    with pytest.warns(UserWarning, match=r"sensor: 'robot/robot_link' (.|\n)*\(left out\)$"):
         sensor = attach(shapes=shapes)
     (body,) = sensor.scene()
     assert body.shape == cs.Sphere(0.01)

@@ -183,6 +183,30 @@ def test_newton(device, bound):
         SensorCapacitance(model, "nose")
 
 
+def test_newton_sees_what_collides():
+    """And what is only drawn where nothing that collides stands in its place."""
+    newton = pytest.importorskip("newton")
+    from capsense.adapters.newton import SensorCapacitance
+
+    builder = newton.ModelBuilder()
+    body = builder.add_body(label="robot")
+    builder.add_site(body, label="pad")
+    drawn = newton.ModelBuilder.ShapeConfig(has_shape_collision=False)
+    arm = builder.add_body(xform=wp.transform((0.0, 0.0, 0.1), wp.quat_identity()), label="arm")
+    builder.add_shape_capsule(arm, radius=0.02, half_height=0.06, label="hull")
+    builder.add_shape_capsule(arm, radius=0.019, half_height=0.06, cfg=drawn, label="shell")
+    far = wp.transform((0.0, 0.0, 0.2), wp.quat_identity())
+    builder.add_shape_sphere(arm, xform=far, radius=0.01, cfg=drawn, label="lamp")
+    model = builder.finalize(device="cpu")
+    seen = {
+        shapes: set(SensorCapacitance(model, "pad", shapes=shapes).names)
+        for shapes in ("collision", "visual", "both")
+    }
+    assert seen["collision"] == {"hull", "lamp"}
+    assert seen["visual"] == {"shell", "lamp"}
+    assert seen["both"] == {"hull", "shell", "lamp"}
+
+
 def test_newton_links_of_one_robot_are_one_conductor():
     """Differential: against one whose places are joined by hand; a body of its own is not."""
     newton = pytest.importorskip("newton")

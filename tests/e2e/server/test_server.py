@@ -46,7 +46,7 @@ def test_welcome(served: RunningServer) -> None:
             "type": "welcome", "protocol": 1, "server": f"capsense {cs.__version__}",
             "designs": ["six_patch", "patch"],
             "limits": {"sensors": 8, "pixels": 65536, "bodies": 64, "message": 40 + 8 * 65536},
-            "touch": True,
+            "touch": True, "hands": True,
         }  # fmt: skip
 
 

@@ -17,9 +17,9 @@ PAGE = (Path(__file__).parents[3] / "docs" / "server.md").read_text(encoding="ut
 URL = "ws://127.0.0.1:8765"
 
 
-def snippet(language: str, server: RunningServer) -> str:
-    """The page's code in a language, for this server."""
-    (code,) = re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
+def snippet(language: str, server: RunningServer, number: int = 0) -> str:
+    """A piece of the page's code in a language, for this server."""
+    code: str = re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)[number]
     assert code.count(URL) == 1
     return code.replace(URL, server.url)
 
@@ -31,6 +31,13 @@ def test_python(served: RunningServer) -> None:
     own = scope["reading"].delta.diagonal()
     assert (own > 0).all()
     assert np.argmax(own) in (2, 5)
+
+
+def test_hands(served: RunningServer) -> None:
+    """The hand of the page is over the sensor."""
+    scope: dict = {}
+    exec(snippet("python", served, 1), scope)
+    assert scope["reading"].delta.diagonal().min() > 5e-15
 
 
 def test_javascript(served: RunningServer, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ using System.Linq;
 using System.Threading;
 using CapSense;
 using UnityEngine;
+using UnityEngine.XR.Hands;
 
 public static class Driver
 {
@@ -24,6 +25,7 @@ public static class Driver
             case "sample": Sample(url); break;
             case "settings": Settings(url); break;
             case "silent": Silent(url); break;
+            case "hands": Hands(url); break;
             default: return 2;
         }
         return 0;
@@ -263,5 +265,61 @@ public static class Driver
             "heights", bars.Select(b => b.transform.localScale.y).ToArray(),
             "delta", sensor.Reading.Delta.Cast<double>().ToArray());
         sensor.Tell("OnDisable");
+    }
+
+    /// <summary>The component of hands; where things stand comes as JSON. A frame, its reading, no hand.</summary>
+    private static void Hands(string url)
+    {
+        var told = (Dictionary<string, object>)Json.Parse(Console.ReadLine());
+        var sensor = new GameObject("sensor").AddComponent<CapSenseHands>();
+        sensor.url = url;
+        sensor.sex = "female";
+        sensor.tipsOnSkin = (bool)told["skin"];
+        sensor.transform.position = Vector(told["position"]);
+        sensor.transform.rotation = Turn(told["rotation"]);
+        sensor.origin = new GameObject("origin").transform;
+        sensor.origin.position = Vector(told["origin"]);
+        sensor.origin.rotation = Turn(told["turn"]);
+        var joints = ((List<object>)told["joints"]).Select(p => new XRHandJoint
+        {
+            At = p == null ? (UnityEngine.Pose?)null : new UnityEngine.Pose(Vector(p), new Quaternion()),
+            Radius = 0.008f,
+        }).ToArray();
+        var subsystem = new XRHandSubsystem { rightHand = new XRHand { Joints = joints } };
+        SubsystemManager.All.Add(new XRHandSubsystem());
+        SubsystemManager.All.Add(subsystem);
+        Console.WriteLine(sensor.Take(0.5).ToMessage(3, 4));
+        subsystem.running = true;
+        Console.WriteLine(sensor.Take(0.5).ToMessage(3, 4));
+        sensor.Tell("OnEnable");
+        var limit = Stopwatch.StartNew();
+        int received = 0;
+        sensor.Received += reading => received++;
+        while (received < 3 && limit.Elapsed.TotalSeconds < 20)
+        {
+            UnityEngine.Time.time += 0.5f;
+            sensor.Tell("LateUpdate");
+            Thread.Sleep(5);
+        }
+        Print("delta", sensor.Reading.Delta.Cast<double>().ToArray(), "state", sensor.State.ToString());
+        sensor.Tell("OnDisable");
+        Print("state", sensor.State.ToString());
+    }
+
+    private static float[] Floats(object list)
+    {
+        return ((List<object>)list).Select(x => (float)(double)x).ToArray();
+    }
+
+    private static Vector3 Vector(object list)
+    {
+        float[] p = Floats(list);
+        return new Vector3(p[0], p[1], p[2]);
+    }
+
+    private static Quaternion Turn(object list)
+    {
+        float[] q = Floats(list);
+        return new Quaternion(q[0], q[1], q[2], q[3]);
     }
 }

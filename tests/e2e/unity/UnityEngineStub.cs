@@ -80,8 +80,9 @@ namespace UnityEngine
     public class Transform : Component
     {
         public Vector3 position, localScale, lossyScale = new Vector3(1, 1, 1);
-        public Quaternion rotation;
+        public Quaternion rotation = new Quaternion(0, 0, 0, 1);
         public void SetParent(Transform parent, bool keep) { }
+        public Vector3 TransformPoint(Vector3 p) { return rotation * p + position; }
     }
 
     public struct Vector3
@@ -90,10 +91,21 @@ namespace UnityEngine
         public static readonly Vector3 right = new Vector3(1, 0, 0), up = new Vector3(0, 1, 0),
             forward = new Vector3(0, 0, 1);
         public Vector3(float x, float y, float z) { this.x = x; this.y = y; this.z = z; }
+        public static Vector3 operator +(Vector3 a, Vector3 b) { return new Vector3(a.x + b.x, a.y + b.y, a.z + b.z); }
+        public static Vector3 operator -(Vector3 a, Vector3 b) { return new Vector3(a.x - b.x, a.y - b.y, a.z - b.z); }
     }
 
     public struct Quaternion
     {
+        public float x, y, z, w;
+        public Quaternion(float x, float y, float z, float w) { this.x = x; this.y = y; this.z = z; this.w = w; }
+        public static Quaternion Inverse(Quaternion q) { return new Quaternion(-q.x, -q.y, -q.z, q.w); }
+        public static Vector3 operator *(Quaternion q, Vector3 v)
+        {
+            float tx = 2 * (q.y * v.z - q.z * v.y), ty = 2 * (q.z * v.x - q.x * v.z), tz = 2 * (q.x * v.y - q.y * v.x);
+            return new Vector3(v.x + q.w * tx + q.y * tz - q.z * ty, v.y + q.w * ty + q.z * tx - q.x * tz,
+                v.z + q.w * tz + q.x * ty - q.y * tx);
+        }
         public static Quaternion LookRotation(Vector3 forward, Vector3 up) { return new Quaternion(); }
     }
 

@@ -23,6 +23,8 @@ from running_server import RunningServer
 
 import capsense as cs
 from capsense.bench import moving_depth
+from capsense.humans import Build, TrackedHand
+from capsense.server.messages import MessageTable, read_hands
 from capsense.simulator import Simulator
 
 HERE = Path(__file__).parent
@@ -59,10 +61,10 @@ def served() -> Any:
         yield server
 
 
-def run(program: Path, *words: str) -> list[dict[str, Any]]:
-    """The lines that the driver prints for a task."""
+def run(program: Path, *words: str, told: str | None = None) -> list[dict[str, Any]]:
+    """The lines that the driver prints for a task, and what it was told."""
     done = subprocess.run(
-        ["mono", str(program), *words], capture_output=True, text=True, timeout=TIMEOUT
+        ["mono", str(program), *words], capture_output=True, text=True, timeout=TIMEOUT, input=told
     )
     assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
@@ -76,7 +78,7 @@ def matrix(flat: list[float]) -> np.ndarray:
 @needs_mono
 def test_client_needs_the_base_library_alone(tmp_path: Path) -> None:
     """It compiles without anything of Unity's."""
-    client = ("CapSenseClient", "RemoteSensor", "Wire", "Json")
+    client = ("CapSenseClient", "RemoteSensor", "Wire", "Json", "HandFrame")
     sources = [str(PACKAGE / "Runtime" / f"{name}.cs") for name in client]
     compile_sources("-target:library", f"-out:{tmp_path / 'client.dll'}", *sources)
 
@@ -228,6 +230,55 @@ def test_sample(program: Path, served: RunningServer) -> None:
     own = np.diag(matrix(line["delta"]))
     assert own.min() > 1e-15
     assert line["heights"] == approx(np.maximum(own / 1e-12, 0.001), rel=1e-6)
+
+
+@needs_mono
+@pytest.mark.parametrize("skin", [False, True])
+def test_hands(program: Path, served: RunningServer, skin: bool) -> None:
+    """Joints of XR Hands, in its order and Unity's axes, are sensed as the same hand here.
+
+    The sensor and the XR Origin stand anywhere; a joint is missing, and the left hand.
+    """
+    rng = np.random.default_rng(4)
+    model = TrackedHand(Build("female"), "right", "openxr", "skin" if skin else "inside")
+    down = cs.Pose.from_matrix(np.stack([(0, 1, 0), (0, 0, -1), (-1, 0, 0)], axis=1))
+    joints = model.joints({"index_pip_flexion": 0.5}, cs.Pose((-0.1, 0, 0.04)) @ down)
+    sensor, origin = (cs.Pose(rng.uniform(-1, 1, 3), rng.normal(size=4)) for _ in range(2))
+    unity = origin.inverse().apply(sensor.apply(joints * (-1, 1, 1)))
+    hidden = 6  # the metacarpal of the index finger, which no landmark is
+    order = [1, 0, *range(2, 26)]  # of XR Hands: wrist, palm, …
+    told = {
+        "position": sensor.position, "rotation": sensor.quaternion, "origin": origin.position,
+        "turn": origin.quaternion, "skin": skin,
+        "joints": [None if k == hidden else unity[k].tolist() for k in order],
+    }  # fmt: skip
+    idle, message, reading, last = run(program, "hands", served.url, told=json.dumps(told))
+    assert idle == {"type": "hands", "sensor": 3, "sequence": 4, "time": 0.5, "hands": []}
+    (hand,) = message["hands"]
+    assert (hand["side"], hand["convention"], hand["confidence"]) == ("right", "openxr", 1)
+    assert hand["joints"][hidden] is None
+    found = np.array([[np.nan] * 3 if p is None else p for p in hand["joints"]])
+    joints[hidden] = np.nan
+    np.testing.assert_allclose(found, joints, atol=2e-6)  # float32 at a metre from the origin
+    seen = read_hands(MessageTable(message, "message", "hands")).hands[0]
+    bodies = model.bodies(model.landmarks(seen.joints, seen.radii), conductor="hands")
+    here = Simulator("six_patch").step(cs.Scene(bodies)).delta
+    assert here[1, 1] > 1e-14
+    assert matrix(reading["delta"]) == approx(here, rel=1e-9)
+    assert reading["state"] == "Connected"
+    assert last == {"state": "Stopped"}
+
+
+def test_the_assembly_of_hands_is_optional() -> None:
+    """It is compiled where XR Hands is installed, and only there."""
+    folder = PACKAGE / "Runtime" / "Hands"
+    made = json.loads((folder / "CapSense.Hands.asmdef").read_text())
+    assert set(made["references"]) == {"CapSense", "Unity.XR.Hands"}
+    (define,) = made["versionDefines"]
+    assert define["name"] == "com.unity.xr.hands"
+    assert made["defineConstraints"] == [define["define"]]
+    others = [p for p in (PACKAGE / "Runtime").glob("*.cs") if "XR.Hands" in p.read_text()]
+    assert others == []
 
 
 json_values = st.recursive(

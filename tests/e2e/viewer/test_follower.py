@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -90,3 +92,27 @@ def test_goes_on_after_a_failure(
     assert player.newest.index == 1
     stream.put(1)
     until(lambda: player.failure is None and player.newest.index == 2)
+
+
+def test_potentials_take_half_of_the_time(
+    followed: tuple[Queued, Follower], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that take long are not begun again before as long has gone by."""
+    stream, _ = followed
+    spans: list[tuple[float, float]] = []
+
+    def slow(frame: object, plane: object) -> np.ndarray:
+        begun = time.monotonic()
+        time.sleep(0.15)
+        spans.append((begun, time.monotonic()))
+        return np.zeros((3, 2))
+
+    monkeypatch.setattr(stream, "potentials", slow)
+
+    def fed() -> bool:
+        stream.put(1)
+        return len(spans) >= 4
+
+    until(fed)
+    pauses = [after[0] - before[1] for before, after in pairwise(spans)]
+    assert min(pauses) > 0.14

@@ -75,6 +75,21 @@ def test_bodies_of_every_shape(server: Any) -> None:
     assert nodes(server, "/bodies/") == []
 
 
+def test_one_label_a_conductor(server: Any) -> None:
+    """Parts of one conductor bear its name once; other bodies their own."""
+    server.scene.reset()
+    stage = SceneDrawing(server, cs.load_design("six_patch"))
+    parts = [
+        cs.Body(cs.Sphere(0.01), cs.Pose((0.03 * k, 0, 0.1)), name=f"b{k}", conductor=conductor)
+        for k, conductor in enumerate(("hand", "hand", None, "other", "hand"))
+    ]
+    stage.show_bodies(cs.Scene([*parts, cs.Body(cs.Sphere(0.01), cs.Pose((0, 0, 0.2)))]))
+    found = nodes_of(server)
+    labels = {name: found[name].text for name in nodes(server, "/names/")}
+    assert labels == {"/names/0": "hand", "/names/2": "b2", "/names/3": "other"}
+    assert len(nodes(server, "/bodies/")) == 6
+
+
 def test_depth_images(server: Any) -> None:
     """A dot for each pixel, where the camera saw it."""
     server.scene.reset()

@@ -11,6 +11,7 @@ from cluster_twin import same_functions, twin_of
 from fleet_scenes import frames, poses, scene
 
 import capsense as cs
+from capsense.constants import UNIT
 from capsense.design import Role, load_design
 from capsense.design.model import Conductor
 from capsense.errors import SceneError
@@ -154,17 +155,22 @@ def test_joined_conductors(device, kind):
     assert (np.abs(found - alone) / np.abs(found)).max() > 0.02
 
 
-def test_joined_places_that_are_out_of_sight_do_not_count():
-    """Invariant: of three joined bodies two are far away; the rest reads as it does alone."""
+def test_joined_places_that_are_out_of_sight_tie_the_rest():
+    """Analytic: of three balls on one wire two are far away; they tie the third by 4 pi eps0 R."""
     bodies = [cs.Body(cs.Sphere(0.02), material="steel", grounding="floating")] * 3
     where = np.zeros((1, 3, 7))
     where[..., 6] = 1.0
     where[0, :, 2] = [50.0, 0.06, 60.0]
     for device in ("cpu", "warp:cpu"):
         fleet = Fleet("six_patch", bodies, 1, device=device)
-        before = as_numpy(fleet.step(where).delta)
+        alone = as_numpy(fleet.step(where).delta)
         fleet.join([0, 1, 2])
-        np.testing.assert_allclose(as_numpy(fleet.step(where).delta), before, rtol=1e-5, atol=0)
+        joined = as_numpy(fleet.step(where).delta)
+        tied = cs.Body(bodies[0].shape, material="steel", grounding=2 * UNIT * 0.02)
+        one = Fleet("six_patch", [tied], 1, device=device)
+        wanted = as_numpy(one.step(where[:, 1:2]).delta)
+        np.testing.assert_allclose(joined, wanted, rtol=3e-3, atol=0)
+        assert np.abs(joined - alone).max() > 0.1 * np.abs(alone).max()
 
 
 def test_only_conductors_are_joined():

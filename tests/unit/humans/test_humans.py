@@ -1,7 +1,8 @@
-"""Arms and legs: sizes against the tables, joints against anatomy, exports against simulators."""
+"""Limbs: sizes against the tables, joints against anatomy, exports against simulators."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 import types
@@ -14,17 +15,26 @@ from approximate import approx
 
 import capsense as cs
 from capsense.errors import MissingDependencyError, SceneError
-from capsense.humans import Build, Limb, arm, leg, load_smplx
+from capsense.humans import Build, Limb, Segment, arm, hand, leg, load_smplx
 from capsense.humans.formats import close_openings, mjcf_body
 from capsense.scene import Ties
+from capsense.solver.tree.matter import matter_of
 
-LIMBS = [make(side=side) for make in (arm, leg) for side in ("left", "right")]  # type: ignore[arg-type]
+LIMBS = [make(side=side) for make in (arm, leg, hand) for side in ("left", "right")]  # type: ignore[arg-type]
 
 
 def random_angles(limb: Limb, seed: int) -> dict[str, float]:
     """Angles [rad] anywhere within the ranges."""
     rng = np.random.default_rng(seed)
     return {j.name: float(rng.uniform(j.lower, j.upper)) for j in limb.joints}
+
+
+def conductors(bodies: list[cs.Body]) -> int:
+    """How many conductors bodies are, by what touches what, whatever their names."""
+    bodies = [cs.Body(b.shape, b.pose, b.material, "floating") for b in bodies]
+    scene = cs.Scene(bodies)
+    joined = matter_of(bodies, 250e3).joined(scene, scene.pack(), np.arange(len(bodies)))
+    return len(set(joined.group.tolist()))
 
 
 def lowest(limb: Limb) -> float:
@@ -61,6 +71,50 @@ def test_sizes_follow_the_tables() -> None:
     assert section == approx(0.1866 * 1.1 * 1.70 / 1.6285)
     assert lowest(arm(build)) == approx(-(0.186 + 0.146 + 0.108) * 1.70, abs=2e-4)
     assert lowest(leg(build)) == approx(-(0.245 + 0.246 + 0.039) * 1.70, abs=2e-4)
+
+
+@pytest.mark.parametrize("sex", ["female", "male"])
+def test_hands_follow_the_tables(sex: Any) -> None:
+    """Length over all, bones of the fingers, breadth over the knuckles, mass."""
+    build = Build(sex, girth=1.1)
+    limb = hand(build)
+    assert lowest(limb) == approx(-build.length("hand"), abs=2e-4)
+    where = limb.forward()
+    for finger, bones in {"index": (0.245, 0.143), "little": (0.204, 0.117)}.items():
+        ends = [where[f"{finger}_{k}"].position for k in ("proximal", "intermediate", "distal")]
+        found = [math.dist(a, b) for a, b in itertools.pairwise(ends)]
+        assert found == approx(np.array(bones) * build.length("hand") / 0.99, rel=1e-3)
+    across = [p.end[0] + side * p.radius for p in limb.segments[0].parts for side in (-1, 1)]
+    assert max(across) - min(across) == approx(build.hand_breadth, rel=0.03)
+    assert sum(s.mass for s in limb.segments) == approx(0.006 * build.mass)
+    detailed = {s.name: s for s in arm(build, hand="detailed").segments}
+    assert detailed["palm"].parent == "forearm"
+    assert detailed["palm"].origin == approx(np.array((0, 0, -build.length("forearm"))))
+    for segment in limb.segments[1:]:
+        assert detailed[segment.name] == segment
+
+
+@pytest.mark.parametrize("limb", LIMBS, ids=lambda k: k.name)
+def test_a_limb_is_one_conductor(limb: Limb) -> None:
+    """All parts hang together, at any angles; fingers without their palm do not."""
+    for seed in range(3):
+        bodies = limb.bodies(angles=random_angles(limb, seed), grounding="floating")
+        assert conductors(bodies) == 1
+    if "hand" in limb.name:
+        assert conductors([b for b in limb.bodies() if "palm" not in str(b.name)]) > 1
+
+
+def test_trees_are_checked() -> None:
+    """A segment that hangs on what comes later, or on nothing."""
+    palm, thumb, *_ = sorted(
+        hand().segments, key=lambda s: s.name not in ("palm", "thumb_metacarpal")
+    )
+    with pytest.raises(
+        cs.SceneError, match="thumb_metacarpal hangs on 'palm', which is no segment"
+    ):
+        Limb("a", (thumb, palm))
+    with pytest.raises(cs.SceneError, match="b hangs on 'trunk'"):
+        Limb("a", (Segment("b", (0, 0, 0), (), palm.parts, 1.0, "trunk"),))
 
 
 @pytest.mark.parametrize("sex", ["female", "male"])
@@ -113,6 +167,17 @@ def test_wrong_builds_are_refused(options: Any, message: str) -> None:
         ("knee_flexion", "shank", (0, 0, -1), (-1, 0, 0)),
         ("ankle_flexion", "foot", (1, 0, 0), (0, 0, 1)),
         ("ankle_inversion", "foot", (0, 0, -1), "in"),
+        ("index_mcp_flexion", "index_proximal", (0, 0, -1), "in"),
+        ("index_mcp_abduction", "index_proximal", (0, 0, -1), (1, 0, 0)),
+        ("middle_mcp_abduction", "middle_proximal", (0, 0, -1), (1, 0, 0)),
+        ("ring_mcp_abduction", "ring_proximal", (0, 0, -1), (-1, 0, 0)),
+        ("little_mcp_abduction", "little_distal", (0, 0, -1), (-1, 0, 0)),
+        ("ring_pip_flexion", "ring_distal", (0, 0, -1), "in"),
+        ("middle_dip_flexion", "middle_distal", (0, 0, -1), "in"),
+        ("thumb_cmc_flexion", "thumb_distal", (0.5, 0, -0.866), (-0.866, 0, -0.5)),
+        ("thumb_cmc_abduction", "thumb_distal", (0.5, 0, -0.866), "in"),
+        ("thumb_mcp_flexion", "thumb_proximal", (0.707, 0, -1.225), "in"),
+        ("thumb_ip_flexion", "thumb_distal", (0.707, 0, -1.225), (-0.866, 0, -0.5)),
     ],
 )
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -122,7 +187,11 @@ def test_joints_bend_as_they_are_called(
     """Anatomy: which way a small positive angle moves a point of the segment."""
     inwards = np.array((0, 1, 0) if side == "right" else (0, -1, 0))
     towards = {"in": inwards, "out": -inwards}.get(str(direction), direction)
-    limb = next(k for k in (arm(side=side), leg(side=side)) if joint in {j.name for j in k.joints})
+    limb = next(
+        k
+        for k in (arm(side=side), leg(side=side), hand(side=side))
+        if joint in {j.name for j in k.joints}
+    )
     move = [limb.forward({joint: a})[segment].apply(point) for a in (0.0, 0.1)]
     assert np.dot(move[1] - move[0], np.asarray(towards, dtype=float)) > 0.09
 
@@ -148,17 +217,17 @@ def test_wrong_angles_are_refused() -> None:
         arm().forward({"elbow_flexion": math.nan})
     with pytest.raises(cs.SceneError, match="side is 'middle'"):
         leg(side="middle")  # type: ignore[arg-type]
+    with pytest.raises(cs.SceneError, match='hand is \'rough\'; choose "simple" or "detailed"'):
+        arm(hand="rough")  # type: ignore[arg-type]
     with pytest.raises(cs.SceneError, match="pose is"):
         arm().bodies((0, 0, 0))  # type: ignore[arg-type]
 
 
 def test_a_person_is_tied_to_ground_once() -> None:
-    """The bodies of a limb share the capacitance."""
-    bodies = arm().bodies(grounding=100e-12)
-    assert sum(b.grounding for b in bodies) == approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
-    assert {b.grounding for b in arm().bodies(grounding="floating")} == {"floating"}
-    shared = arm().bodies(grounding=Ties(100e-12, 20e-12))
-    assert sum(b.grounding.local for b in shared) == approx(20e-12, rel=1e-9, abs=0)  # type: ignore[union-attr, misc]
+    """The bodies of a limb are one conductor of its name, on the whole capacitance."""
+    for tie in (100e-12, "floating", Ties(100e-12, 20e-12)):
+        found = {(b.grounding, b.conductor) for b in arm().bodies(grounding=tie)}
+        assert found == {(tie, "right_arm")}
     with pytest.raises(SceneError, match=r"which a MuJoCo model cannot say.*attach"):
         arm().mjcf(grounding=Ties(100e-12, 20e-12))
     assert {b.material.name for b in arm().bodies(material="skin")} == {"skin"}
@@ -230,7 +299,7 @@ def test_urdf_stands_as_the_limb_does(limb: Limb, tmp_path: Path) -> None:
 
 
 def test_an_attached_sensor_knows_a_limb(simulators: Any) -> None:
-    """The texts of the MJCF carry over: human, 100 pF in all."""
+    """The texts of the MJCF carry over: human, one conductor on 100 pF."""
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
     model = mujoco.MjSpec.from_string(arm().mjcf(cs.Pose((0, 0, 0.1))))
     model.worldbody.add_site(name="pad", pos=(0.0, 0.1, -0.1), quat=(0.7071, 0.7071, 0, 0))
@@ -240,7 +309,8 @@ def test_an_attached_sensor_knows_a_limb(simulators: Any) -> None:
     scene = cs.mujoco.attach(compiled, data, "pad", simulators("six_patch_bare")).scene()
     assert len(scene) > 2
     assert {b.material.name for b in scene} == {"human"}
-    assert sum(b.grounding for b in scene) == approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
+    assert {b.grounding for b in scene} == {100e-12}
+    assert len({b.conductor for b in scene}) == 1
 
 
 # -- meshes --------------------------------------------------------------------------------------

@@ -161,8 +161,14 @@ def test_turned_meshes_have_the_same_panels():
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and no shapes in memory."""
     monkeypatch.setenv("CAPSENSE_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(store, "_SHAPES", type(store._SHAPES)())
+    forget()
     return tmp_path / "shapes"
+
+
+def forget() -> None:
+    """No shape is at hand any more, as in a process that has just started."""
+    store._SHAPES.clear()
+    store._IN_USE.clear()
 
 
 def small_mesh() -> TriMesh:
@@ -171,7 +177,7 @@ def small_mesh() -> TriMesh:
 
 def found(count: int = 100) -> RigidShape:
     """The shape of the mesh, as a process that has just started finds it."""
-    store._SHAPES.clear()
+    forget()
     return store.rigid(small_mesh(), count)[0]
 
 
@@ -204,7 +210,7 @@ def test_bits_do_not_depend_on_the_size_met_first(
     assert (exact[0] != exact[1]).any()
     met = store.rigid(shape(first), 100)[0]
     assert store.rigid(shape(second), 100)[0] is met
-    store._SHAPES.clear()
+    forget()
     assert_same(store.rigid(shape(second), 100)[0], met)
 
 

@@ -6,6 +6,7 @@ Metres, 4π eps0 = 1. The unknown of a panel is its charge, spread evenly.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -211,6 +212,7 @@ def edges_of(panels: SurfacePanels) -> Array:
     return np.stack([panels.corners, np.roll(panels.corners, -1, axis=1)], axis=2)
 
 
+@lru_cache
 def _line(order: int, bend: float) -> tuple[Array, Array]:
     """Gauss points and weights on 0 ... 1, moved towards the ends by ``bend`` of 3t² − 2t³."""
     t, w = np.polynomial.legendre.leggauss(order)

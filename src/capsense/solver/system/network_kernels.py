@@ -6,6 +6,8 @@ carries no charge, or is coupled to ground by a capacitance, is eliminated from 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from capsense._dense import WIDTH, padded
@@ -20,29 +22,65 @@ COARSE = 31
 
 
 @kernel
-def outside_capacitance(body, space):
-    """Capacitance in free space of what is out of reach of a conductor that is not at ground [m].
+def _outside(body, space, out):
+    """Find how much of a conductor that is not at ground is out of reach.
 
     Coarse clusters count by their shares of the charge, as far as they are out of reach.
+
+    Args:
+        body: The body.
+        space: Surroundings of the design.
+        out: Filled with the capacitance of that part in free space, and its middle [m], (4,).
     """
-    if body.free == 0:
-        return 0.0
     children, charge, center = (
         integers(body.children), doubles(body.charge), doubles(body.center),
     )  # fmt: skip
-    outside, r, p, s = 0.0, body.rotation, body.position, body.scale
+    for i in range(4):
+        out[i] = 0.0
+    r, p, s = body.rotation, body.position, body.scale
     for k in range(min(COARSE, 2 * body.n - 1)):
         if 0 <= children[2 * k] < COARSE - 1:  # its parts stand for it
             continue
         x, y, z = center[3 * k], center[3 * k + 1], center[3 * k + 2]
-        off, _ = off_walls(
-            p[0] + s * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z),
-            p[1] + s * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z),
-            p[2] + s * (r[2, 0] * x + r[2, 1] * y + r[2, 2] * z),
-            body.free, space,
-        )  # fmt: skip
-        outside += charge[k] * smooth(off)
-    return s * body.capacitance * outside / charge[0]
+        u = p[0] + s * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z)
+        v = p[1] + s * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z)
+        w = p[2] + s * (r[2, 0] * x + r[2, 1] * y + r[2, 2] * z)
+        off, _ = off_walls(u, v, w, body.free, space)
+        share = charge[k] * smooth(off)
+        out[0] += share
+        out[1] += share * u
+        out[2] += share * v
+        out[3] += share * w
+    if out[0] > 0.0:
+        for i in range(1, 4):
+            out[i] /= out[0]
+        out[0] *= s * body.capacitance / charge[0]
+
+
+@compiled
+def outside_capacitance(bodies, group, space):
+    """Capacitance in free space of what is out of reach of a conductor not at ground [m].
+
+    Charges on its bodies in proportion to their own capacitances have at least the energy of the
+    true ones (Thomson's theorem), so that this is not too large.
+    """
+    count, charge, energy = bodies.shape[0], 0.0, 0.0
+    parts, known = np.empty((count, 4)), 0
+    for b in range(count):
+        if bodies[b].group == group and bodies[b].free != 0:
+            part = parts[known]
+            _outside(bodies[b], space, part)
+            charge += part[0]
+            energy += part[0]
+            for c in range(known):
+                square = least = 0.0
+                for i in range(1, 4):
+                    square += (part[i] - parts[c, i]) ** 2
+                least = max(part[0], parts[c, 0])
+                if least > 0.0:
+                    energy += 2.0 * part[0] * parts[c, 0] / max(math.sqrt(square), least)
+            known += 1
+    return charge * charge / energy if energy > 0.0 else 0.0
 
 
 @compiled
@@ -53,28 +91,18 @@ def tie_what_is_outside(bodies, space):
     A trunk grounds an arm that floats with it by its own capacitance to everything around, whether
     the domain reaches as far or not.
     """
-    count = bodies.shape[0]
-    found = np.zeros(count)
-    for b in range(count):
-        capacitance = outside_capacitance(bodies[b], space)
-        for c in range(count):
-            if bodies[c].group == bodies[b].group:
-                found[c] += capacitance
-    for b in range(count):
-        if found[b] * FLOATING_PENALTY > 1.0:
-            body = bodies[b]
-            if body.neutral != 0 or body.ground_elastance * found[b] > 1.0:
-                body.neutral, body.ground_elastance = 0, 1.0 / found[b]
-
-
-@kernel
-def is_tied_by_what_is_outside(bodies, b, space):
-    """Whether the conductor of a body has the tie that :func:`tie_what_is_outside` gives it."""
-    total = 0.0
-    for c in range(bodies.shape[0]):
-        if bodies[c].group == bodies[b].group:
-            total += outside_capacitance(bodies[c], space)
-    return total > 0.0 and abs(bodies[b].ground_elastance * total - 1.0) < 1e-9
+    for b in range(bodies.shape[0]):
+        group = bodies[b].group
+        first = bodies[b].free != 0
+        for c in range(b):
+            first = first and bodies[c].group != group
+        found = outside_capacitance(bodies, group, space) if first else 0.0
+        if found * FLOATING_PENALTY > 1.0:
+            for c in range(b, bodies.shape[0]):
+                body = bodies[c]
+                loose = body.neutral != 0 or body.ground_elastance * found > 1.0
+                if body.group == group and loose:
+                    body.neutral, body.ground_elastance = 0, 1.0 / found
 
 
 @compiled

@@ -49,7 +49,6 @@ from capsense.solver.system.network_kernels import (
     as_nodes,
     coarse_of,
     congruent,
-    is_tied_by_what_is_outside,
     mixed,
     outside_capacitance,
     potentials_of,
@@ -320,8 +319,11 @@ def _add_outside_slopes(
     potential = np.empty(m)
     for b in range(bodies.shape[0]):
         body = bodies[b]
-        if body.free == 0 or not is_tied_by_what_is_outside(bodies, b, green.space):
-            continue
+        outside = 0.0
+        if body.free != 0:
+            outside = outside_capacitance(bodies, body.group, green.space)
+        if outside == 0.0 or abs(body.ground_elastance * outside - 1.0) > 1e-9:
+            continue  # it has another tie
         if solution.node[b] >= 0:
             for i in range(m):
                 potential[i] = solution.weights[solution.node[b], i]
@@ -335,9 +337,9 @@ def _add_outside_slopes(
         for r in range(6):
             step = DIFFERENCE * green.gap.validity / (1.0 if r < 3 else arm)
             move(moved[b], body, r, step)
-            change = outside_capacitance(moved[b], green.space)
+            change = outside_capacitance(moved, body.group, green.space)
             move(moved[b], body, r, -step)
-            change -= outside_capacitance(moved[b], green.space)
+            change -= outside_capacitance(moved, body.group, green.space)
             for i in range(m):
                 for j in range(m):
                     out[b, i, j, r] += 0.5 * change / step * potential[i] * potential[j]

@@ -129,6 +129,7 @@ class Matter:
         low, high = packed.bounds[chosen, 0] - 0.5 * near, packed.bounds[chosen, 1] + 0.5 * near
         close = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2)
         close &= seen[:, None] & seen & (self.free[:, None] | self.free)
+        close &= self.group[:, None] != self.group
         first, second = np.nonzero(np.triu(close, 1))
         apart = parted(
             chosen[np.stack([first, second], axis=1)],

@@ -356,7 +356,7 @@ def split(features: Array, charge: Array) -> Clusters:
 
 
 def _of_functions(tree: Tree, block: Array) -> Array32:
-    """Change a symmetric block of panels, which is lost, to one of charge functions."""
+    """Change a symmetric block of panels to one of charge functions."""
     return tree_kernels.table_of_functions(
         block, tree.children, tree.panel, tree.charge, tree.function
     )

@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +111,9 @@ VERSION = 10
 
 _log = logging.getLogger(__name__)
 
-_KEPT = 512_000_000
-"""Shapes are forgotten, the longest unused first, when they take up more than this [bytes]."""
+_KEPT = 1_000_000_000
+"""Shapes that no body has are forgotten, the longest unused first, when all of them take up more
+than this [bytes]."""
 _FILES = 1_000_000_000
 """Most bytes of files; the oldest are removed first."""
 _DIGITS = 9
@@ -133,6 +135,8 @@ many do."""
 
 _LOCK = ForkSafeRLock()
 _SHAPES: OrderedDict[Hashable, RigidShape | DynamicBody] = OrderedDict()
+_IN_USE: WeakValueDictionary[Hashable, RigidShape | DynamicBody] = WeakValueDictionary()
+"""All that are at hand: those above, and others that bodies hold."""
 
 T = TypeVar("T", bound=RigidShape | DynamicBody)
 
@@ -247,14 +251,15 @@ def _kept(
     shape: Shape, count: int, slot: str, make: Callable[[Shape, int, str], T]
 ) -> tuple[T, float]:
     """What is made of a shape's form, once, and how many times as large the shape is."""
-    held = shape.__dict__.get(slot)
-    if held is not None and held[0] == count:
-        return held[1], held[2]
+    held = shape.__dict__.get(f"{slot} {count}")
+    if held is not None:
+        return held
     size, form, whole = _form(shape, count)
     key: Hashable = (slot, *form)
     with _LOCK:
-        found = _SHAPES.get(key)
+        found = _IN_USE.get(key)
         if found is not None:
+            _SHAPES[key] = found
             _SHAPES.move_to_end(key)
     if found is None:
         digest = hashlib.sha256(repr((VERSION, form)).encode())
@@ -262,10 +267,10 @@ def _kept(
         write_outline(made.record, whole)
         made.__dict__["_outline"] = whole  # which the record points to
         with _LOCK:
-            found = _SHAPES.setdefault(key, made)
+            found = _SHAPES[key] = _IN_USE.setdefault(key, made)
             while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
                 _SHAPES.popitem(last=False)
-    shape.__dict__[slot] = (count, found, size)
+    shape.__dict__[f"{slot} {count}"] = cast(T, found), size
     return cast(T, found), size
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._jit import compiled, kernel
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.solver.bodies.panels import SurfacePanels
 from capsense.solver.tree.dynamic_surface import OWN
@@ -76,7 +77,7 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
         finest: Parts with a side longer than this are halved [m].
         surface: The surface that its panels approximate.
     """
-    if _sides(_flat(shape.panels)[0]).max() <= finest:
+    if _longest(_flat(shape.panels)[0]) <= finest:
         return shape
     return RefinedShape(
         shape.panels,
@@ -90,68 +91,132 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
 
 
 def _flat(panels: SurfacePanels) -> tuple[Array, Array]:
-    """Corners in the plane of each panel [m], (2, 4, n), and the axes of these planes, (2, n, 3).
+    """Corners in the plane of each panel [m], (n, 4, 2), and the axes of these planes, (2, n, 3).
 
     Their origins are the panels' centres.
     """
     first = panels.corners[:, 1] - panels.corners[:, 0]
     first = first / np.linalg.norm(first, axis=1)[:, None]
     axes = np.stack([first, np.cross(panels.normals, first)])
-    return np.einsum("nqi,ani->aqn", panels.corners - panels.centers[:, None], axes), axes
+    return np.einsum("nqi,ani->nqa", panels.corners - panels.centers[:, None], axes), axes
 
 
-def _sides(corners: Array) -> Array:
-    """Mean lengths of the two pairs of opposite sides [m], (2, 4, n) -> (2, n)."""
-    length = np.hypot(*(np.roll(corners, -1, axis=1) - corners))
-    return np.asarray(0.5 * (length[:2] + length[2:]))
+@kernel
+def _sides(corners: Array) -> tuple[float, float]:
+    """Mean lengths of the two pairs of opposite sides of a polygon in its plane [m], (4, 2)."""
+    one = other = 0.0
+    for q in range(0, 4, 2):
+        a, b, c = corners[q], corners[q + 1], corners[(q + 2) % 4]
+        one += 0.5 * math.hypot(b[0] - a[0], b[1] - a[1])
+        other += 0.5 * math.hypot(c[0] - b[0], c[1] - b[1])
+    return one, other
 
 
-def halved(corners: Array, finest: float) -> tuple[Array, Ints, Ints]:
+@compiled
+def _longest(corners: Array) -> float:
+    """The longest such length of any polygon, (n, 4, 2)."""
+    out = 0.0
+    for k in range(corners.shape[0]):
+        out = max(out, max(_sides(corners[k])))
+    return out
+
+
+@compiled
+def halved(whole: Array, finest: float) -> tuple[Array, Ints, Ints]:
     """Halve polygons across their longer sides, breadth first.
 
     Args:
-        corners: Of n panels in planes of their own [m], shape (2, 4, n).
+        whole: Corners of n panels in planes of their own [m], shape (n, 4, 2).
         finest: Those with a longer side are halved [m].
 
     Returns:
-        Corners of the panels and all their parts, shape (2, 4, k); the parts of each, -1 where it
+        Corners of the panels and all their parts, shape (k, 4, 2); the parts of each, -1 where it
         has none, shape (k, 2); and the panel that it lies in, shape (k,).
     """
-    levels, children, panel, count = [corners], [], [np.arange(corners.shape[2])], corners.shape[2]
+    count = whole.shape[0]
+    room = count * (2 ** (_MOST + 1) - 1)
+    corners, children = np.empty((room, 4, 2)), np.empty((room, 2), np.int64)
+    panel = np.empty(room, np.int64)
+    for k in range(count):
+        corners[k], panel[k] = whole[k], k
+    first = 0
     for level in range(_MOST + 1):
-        sides = _sides(levels[-1])
-        long = np.flatnonzero((sides.max(axis=0) > finest) & (level < _MOST))
-        parts = np.full((sides.shape[1], 2), -1)
-        parts[long] = count + np.arange(2 * len(long)).reshape(-1, 2)
-        children.append(parts)
-        if not len(long):
-            break
-        count += 2 * len(long)
-        whole = levels[-1][:, :, long]
-        # brought to where sides (0, 1) and (2, 3) are the longer ones
-        whole = np.where(sides[1, long] > sides[0, long], np.roll(whole, -1, axis=1), whole)
-        a, b, c, d = whole.transpose(1, 0, 2)
-        near, far = 0.5 * (a + b), 0.5 * (c + d)
-        both = np.stack([np.stack([a, near, far, d], 1), np.stack([near, b, c, far], 1)], axis=3)
-        levels.append(both.reshape(2, 4, -1))
-        panel.append(np.repeat(panel[-1][long], 2))
-    return np.concatenate(levels, axis=2), np.concatenate(children), np.concatenate(panel)
+        last = count
+        for k in range(first, last):
+            children[k] = -1
+            one, other = _sides(corners[k])
+            if level == _MOST or max(one, other) <= finest:
+                continue
+            turn = 1 if other > one else 0  # sides (0, 1) and (2, 3) are the longer ones then
+            for d in range(2):
+                a, b = corners[k, turn, d], corners[k, turn + 1, d]
+                c, e = corners[k, turn + 2, d], corners[k, (turn + 3) % 4, d]
+                near, far = 0.5 * (a + b), 0.5 * (c + e)
+                left, right = corners[count], corners[count + 1]
+                left[0, d], left[1, d], left[2, d], left[3, d] = a, near, far, e
+                right[0, d], right[1, d], right[2, d], right[3, d] = near, b, c, far
+            for side in range(2):
+                children[k, side], panel[count + side] = count + side, panel[k]
+            count += 2
+        first = last
+    return corners[:count], children[:count], panel[:count]
 
 
-def _moments(corners: Array) -> tuple[Array, Array, Array]:
-    """Areas (n,), centroids (2, n) and second central moments xx, yy, xy (3, n) of polygons."""
-    origin = corners[:, 0]
-    u, v, w = (corners[:, k] - origin for k in (1, 2, 3))
-    double = np.stack([u[0] * v[1] - u[1] * v[0], v[0] * w[1] - v[1] * w[0]])
-    area = double.sum(axis=0)
-    center, moments = np.zeros_like(origin), np.zeros((3, len(area)))
-    for part, (a, b) in zip(double / area, ((u, v), (v, w)), strict=True):
-        # of a triangle with one corner at the origin
-        center += part * (a + b) / 3
-        for x in (a, b, a + b):
-            moments += part / 12 * np.stack([x[0] * x[0], x[1] * x[1], x[0] * x[1]])
-    moments -= np.stack([center[0] ** 2, center[1] ** 2, center[0] * center[1]])
-    return 0.5 * np.abs(area), origin + center, moments
+@kernel
+def _double(corners: Array, q: int) -> float:
+    """Twice the area of the triangle of corners 0, q and q + 1 of a polygon [m²], (4, 2)."""
+    x, y = corners[0]
+    ax, ay = corners[q, 0] - x, corners[q, 1] - y
+    return ax * (corners[q + 1, 1] - y) - ay * (corners[q + 1, 0] - x)
+
+
+@compiled
+def _four_points(
+    corners: Array, panel: Ints, axes: Array, middles: Array, area: Array, extent: Array,
+    points: Array,
+) -> None:  # fmt: skip
+    """Find the four points of parts of panels, as ``rigid.four_points_of`` does those of clusters.
+
+    Args:
+        corners: Of the parts in the planes of their panels [m], shape (k, 4, 2).
+        panel: The panel of each, shape (k,).
+        axes: Of these planes, shape (2, n, 3).
+        middles: Their origins [m], shape (n, 3).
+        area: Filled with the parts' areas [m²], shape (k,).
+        extent: Filled with their extents [m], shape (k,).
+        points: Filled with the points [m], shape (k, 4, 3).
+    """
+    for k in range(corners.shape[0]):
+        x0, y0 = corners[k, 0, 0], corners[k, 0, 1]
+        total = x = y = xx = yy = xy = 0.0
+        for q in range(1, 3):
+            total += _double(corners[k], q)
+        for q in range(1, 3):
+            ax, ay = corners[k, q, 0] - x0, corners[k, q, 1] - y0
+            bx, by = corners[k, q + 1, 0] - x0, corners[k, q + 1, 1] - y0
+            part, sx, sy = _double(corners[k], q) / total, ax + bx, ay + by
+            x += part * sx / 3
+            y += part * sy / 3
+            for u, v in ((ax, ay), (bx, by), (sx, sy)):
+                xx += part / 12 * (u * u)
+                yy += part / 12 * (v * v)
+                xy += part / 12 * (u * v)
+        xx, yy, xy = xx - x * x, yy - y * y, xy - x * y
+        turn, spread = 0.5 * math.atan2(2 * xy, xx - yy), math.hypot(0.5 * (xx - yy), xy)
+        long = math.sqrt(0.5 * (xx + yy) + spread)
+        short = math.sqrt(max(0.5 * (xx + yy) - spread, 0.0))
+        cos, sin = math.cos(turn), math.sin(turn)
+        area[k], extent[k] = 0.5 * abs(total), math.sqrt(12.0) * long
+        n = panel[k]
+        for d in range(3):
+            u, v = axes[0, n, d], axes[1, n, d]
+            center = middles[n, d] + ((x0 + x) * u + (y0 + y) * v)
+            first = long * cos * u + long * sin * v
+            second = -short * sin * u + short * cos * v
+            points[k, 0, d] = center + first + second
+            points[k, 1, d] = center + first - second
+            points[k, 2, d] = center - first + second
+            points[k, 3, d] = center - first - second
 
 
 def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
@@ -159,43 +224,27 @@ def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
     panels, tree, m = shape.panels, shape.tree, len(shape.panels)
     flat, axes = _flat(panels)
     corners, children, panel = halved(flat, shape.finest)
-    area, center, (xx, yy, xy) = _moments(corners[:, :, m:])
-    axes, middle = axes[:, panel[m:]], panels.centers[panel[m:]]
-    # the four points of each, as ``rigid.four_points_of`` finds them
-    turn, spread = 0.5 * np.arctan2(2 * xy, xx - yy), np.hypot(0.5 * (xx - yy), xy)
-    long = np.sqrt(0.5 * (xx + yy) + spread)
-    short = np.sqrt(np.maximum(0.5 * (xx + yy) - spread, 0.0))
-    cos, sin = np.cos(turn), np.sin(turn)
-    first, second = _lines(axes, long * cos, long * sin), _lines(axes, -short * sin, short * cos)
-    centers = middle + _lines(axes, *center)
-    points = np.empty((len(area), 4, 3))
-    for q, (p, r) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        points[:, q] = centers + p * first + r * second
+    inner, count = panel[m:], len(panel) - m
+    area, extent, points = np.empty(count), np.empty(count), np.empty((count, 4, 3))
+    _four_points(corners[m:], inner, axes, panels.centers, area, extent, points)
     if shape.surface.kind not in (ShapeKind.BOX, ShapeKind.MESH):
-        normals = panels.normals[panel[m:]]
-        for q in range(4):
-            points[:, q] -= shape.surface.signed_distance(points[:, q])[:, None] * normals
-        centers = points.mean(axis=1)
+        off = shape.surface.signed_distance(points.reshape(-1, 3)).reshape(count, 4, 1)
+        points -= off * panels.normals[inner][:, None]
+    centers = 0.25 * (points[:, 0] + points[:, 1] + points[:, 2] + points[:, 3])
     place = np.arange(len(panel)) + m - 1  # clusters of panels and parts
     place[tree.panel[tree.panel >= 0]] = np.flatnonzero(tree.panel >= 0)
     cut = np.flatnonzero(children[:, 0] >= 0)
-    all_kids = np.concatenate([tree.children, np.full((len(area), 2), -1)])
+    all_kids = np.concatenate([tree.children, np.full((count, 2), -1)])
     all_kids[place[cut]] = place[children[cut]]
-    function = np.concatenate([tree.function, np.full(len(area), -1)])
+    function = np.concatenate([tree.function, np.full(count, -1)])
     function[place[cut]] = m + np.arange(len(cut))
     density = tree.charge[place[:m]] / panels.areas
-    extent = math.sqrt(12.0) * long
     size = np.concatenate([tree.extent, extent])
     return {
         "children": all_kids, "function": function, "extent": size,
         "own": np.concatenate([shape.own, OWN / size[place[cut]]]),
-        "charge": np.concatenate([tree.charge, density[panel[m:]] * area]),
+        "charge": np.concatenate([tree.charge, density[inner] * area]),
         "center": np.concatenate([tree.center, centers]),
         "points": np.concatenate([tree.points, points]),
         "softening_length": np.concatenate([tree.softening_length, SOFT * extent]),
     }  # fmt: skip
-
-
-def _lines(axes: Array, x: Array, y: Array) -> Array:
-    """From coordinates in planes of axes (2, n, 3) to vectors, (n, 3)."""
-    return np.asarray(x[:, None] * axes[0] + y[:, None] * axes[1])

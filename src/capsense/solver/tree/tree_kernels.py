@@ -8,8 +8,6 @@ from capsense._dense import mirror
 from capsense._jit import compiled, kernel
 from capsense._simd import WIDE
 
-_COLUMNS = 256
-"""Columns of a matrix that are taken at a time."""
 _BLOCK = 64
 """Rows and columns of a table that are turned at a time."""
 _TIE = 1e-6
@@ -227,7 +225,7 @@ def _upwards(children, order):
 
 @compiled
 def to_functions(values, children, panel, charge, function, out):
-    """Integrate columns of panel values with every charge function, some columns at a time.
+    """Integrate columns of panel values with every charge function.
 
     Args:
         values: Mean values on the panels, shape (n, k).
@@ -238,25 +236,24 @@ def to_functions(values, children, panel, charge, function, out):
         out: Filled, function 0 with the mean over the body, shape (n, k).
     """
     order = np.empty(children.shape[0], np.int64)
-    means = np.empty((_upwards(children, order), _COLUMNS))
-    for start in range(0, values.shape[1], _COLUMNS):
-        width, top = min(_COLUMNS, values.shape[1] - start), 0
-        for k in order:
-            if children[k, 0] < 0:
-                line, mean = values[panel[k]], means[top]
-                for c in range(width):
-                    mean[c] = line[start + c]
-                top += 1
-                continue
-            top -= 1
-            first, second, line = means[top - 1], means[top], out[function[k]]
-            share = charge[children[k, 0]] / charge[k]
+    width, top = values.shape[1], 0
+    means = np.empty((_upwards(children, order), width))
+    for k in order:
+        if children[k, 0] < 0:
+            line, mean = values[panel[k]], means[top]
             for c in range(width):
-                line[start + c] = first[c] - second[c]
-            for c in range(width):
-                first[c] = share * first[c] + (1.0 - share) * second[c]
+                mean[c] = line[c]
+            top += 1
+            continue
+        top -= 1
+        first, second, line = means[top - 1], means[top], out[function[k]]
+        share = charge[children[k, 0]] / charge[k]
         for c in range(width):
-            out[0, start + c] = means[0, c]
+            line[c] = first[c] - second[c]
+        for c in range(width):
+            first[c] = share * first[c] + (1.0 - share) * second[c]
+    for c in range(width):
+        out[0, c] = means[0, c]
 
 
 @compiled
@@ -264,7 +261,7 @@ def table_of_functions(block, children, panel, charge, function):
     """Integrate a symmetric table of panel values with every charge function, both ways.
 
     Args:
-        block: Mean values between panels, shape (n, n); lost.
+        block: Mean values between panels, shape (n, n).
         children, panel, charge, function: As in :func:`to_functions`.
 
     Returns:
@@ -278,10 +275,7 @@ def table_of_functions(block, children, panel, charge, function):
             for i in range(start, min(start + _BLOCK, n)):
                 for j in range(low, min(low + _BLOCK, i)):
                     rows[i, j], rows[j, i] = rows[j, i], rows[i, j]
-    to_functions(rows, children, panel, charge, function, block)
-    for i in range(n):
-        for j in range(i + 1):
-            out[i, j] = block[i, j]
+    to_functions(rows, children, panel, charge, function, out)
     mirror(out)
     return out
 
