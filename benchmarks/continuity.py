@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections import defaultdict
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +81,32 @@ class Group:
         )
 
 
+def largest_jump(read: Callable[[float], Array], at: Array, count: int = 4) -> float:
+    """Largest change of a reading, over the largest of it, within 1e-12 of a parameter.
+
+    The ``count`` steps that change most are halved, on the side that changes more.
+
+    Args:
+        read: Gives a reading, shape (n,).
+        at: Values of the parameter, in order.
+        count: So many steps are looked into.
+    """
+    found = np.array([read(x) for x in at])
+    changes = np.abs(np.diff(found, axis=0)).max(axis=1) / found[1:].max(axis=1)
+    out = 0.0
+    for k in np.argsort(changes)[-count:]:
+        (a, b), (start, end) = at[k : k + 2], found[k : k + 2]
+        while abs(b - a) > 1e-12:
+            middle = 0.5 * (a + b)
+            here = read(middle)
+            if np.abs(here - start).max() > np.abs(end - here).max():
+                b, end = middle, here
+            else:
+                a, start = middle, here
+        out = max(out, float(np.abs(end - start).max() / start.max()))
+    return out
+
+
 def judge(sim: cs.Simulator, group: Group, tie: str | float) -> tuple[float, float]:
     """The two figures."""
 
@@ -89,18 +116,7 @@ def judge(sim: cs.Simulator, group: Group, tie: str | float) -> tuple[float, flo
     at = np.linspace(WAY, 0.0, STEPS + 1)
     found = np.array([read(x) for x in at])
     changes = np.abs(np.diff(found, axis=0)).max(axis=1) / found[1:].max(axis=1)
-    jump = 0.0
-    for k in np.argsort(changes)[-4:]:
-        (a, b), (start, end) = at[k : k + 2], found[k : k + 2]
-        while abs(b - a) > 1e-12:
-            middle = 0.5 * (a + b)
-            here = read(middle)
-            if np.abs(here - start).max() > np.abs(end - here).max():
-                b, end = middle, here
-            else:
-                a, start = middle, here
-        jump = max(jump, float(np.abs(end - start).max() / start.max()))
-    slope = 0.0
+    jump, slope = largest_jump(read, at), 0.0
     behind = [k for k in np.argsort(changes)[::-1].tolist() if group.clear(at[k + 1])]
     for k in behind[:1]:
         fine = np.array([read(x) for x in np.arange(at[k], at[k + 1], -1e-3)])

@@ -11,14 +11,8 @@ namespace CapSense
     /// permittivity where objects wear the CapSense/Permittivity shader.
     /// </remarks>
     [AddComponentMenu("CapSense/Capacitive Sensor")]
-    public sealed class CapacitiveSensor : MonoBehaviour
+    public sealed class CapacitiveSensor : ServedSensor
     {
-        [Tooltip("Address of the server: capsense serve --design six_patch")]
-        public string url = "ws://127.0.0.1:8765";
-        [Tooltip("What the server asks for; empty without a token")]
-        public string token = "";
-        [Tooltip("Design that the server serves; empty for its first")]
-        public string design = "";
         [Tooltip("What everything is made of, without permittivity codes")]
         public string material = "human";
         [Tooltip("Read relative permittivities from the red channel")]
@@ -29,44 +23,16 @@ namespace CapSense
         public float size = 0.5f;
         [Tooltip("How far the sensor sees [m]")]
         public float range = 0.5f;
-        [Tooltip("Images a second; 0: one every frame")]
-        public float rate;
         [Tooltip("Layers that the sensor sees")]
         public LayerMask seen = ~0;
 
-        private CapSenseClient client;
-        private RemoteSensor remote;
         private DepthCamera view;
-        private float next;
-        private bool refused;
         private Settings made;
-
-        /// <summary>The newest reading; null before the first.</summary>
-        public Reading Reading { get; private set; }
-
-        /// <summary>Raised on Unity's own thread with every new reading.</summary>
-        public event System.Action<Reading> Received;
-
-        /// <summary>The sensor on the server: electrode names, baseline, errors.</summary>
-        public RemoteSensor Remote { get { return remote; } }
-
-        /// <summary>Where the connection stands.</summary>
-        public ClientState State { get { return client == null ? ClientState.Stopped : client.State; } }
 
         private void OnEnable()
         {
             made = Wanted;
-            try
-            {
-                client = new CapSenseClient(url, token);
-            }
-            catch (System.ArgumentException error)
-            {
-                client = null;
-                Debug.LogError("CapSense: " + error.Message, this);
-                return;
-            }
-            remote = client.Add(new SensorOptions
+            bool opened = Open(new SensorOptions
             {
                 Design = design,
                 Width = size,
@@ -75,15 +41,13 @@ namespace CapSense
                 Columns = "-x",
                 Material = material,
             });
-            view = new DepthCamera(transform, resolution, size, range, seen, permittivityCodes);
-            client.Start();
+            if (opened) view = new DepthCamera(transform, resolution, size, range, seen, permittivityCodes);
         }
 
         private void OnDisable()
         {
-            if (client != null) client.Dispose();
+            Close();
             if (view != null) view.Dispose();
-            client = null;
             view = null;
         }
 
@@ -94,20 +58,8 @@ namespace CapSense
                 OnDisable();
                 OnEnable();
             }
-            if (client == null) return;
-            Reading found;
-            if (remote.TryTake(out found))
-            {
-                Reading = found;
-                if (Received != null) Received(found);
-            }
-            if (!refused && client.State == ClientState.Refused)
-                Debug.LogError("CapSense: " + client.LastError.Message, this);
-            refused = client.State == ClientState.Refused;
             // while an answer is waited for nothing is rendered
-            if (!remote.Idle || Time.time < next) return;
-            next = rate > 0 ? Mathf.Max(next + 1 / rate, Time.time) : 0;
-            remote.Submit(view.Take(Time.timeAsDouble));
+            if (Poll()) Remote.Submit(view.Take(Time.timeAsDouble));
         }
 
         private Settings Wanted

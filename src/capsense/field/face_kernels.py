@@ -15,11 +15,11 @@ from capsense._by_reference import by_reference
 from capsense._jit import kernel
 
 WALL_EDGE = 0.01
-"""Bodies are out of the room so far beyond its bounds, over the domain's shortest side."""
-WALL_FADE_LENGTH = 0.01, 0.08
-"""They fade out over this distance up to there, over that side; the second of conductors that are
-not at ground, whose potential the walls would else hold as they come in. Next to the design, and
-behind its face, all fade over the first."""
+"""Bodies are out of the room so far beyond its bounds, over the domain's shortest side. They fade
+out from the bounds on."""
+WALL_FADE_LENGTH = 0.08
+"""Conductors that are not at ground, whose potential the walls would else hold as they come in,
+fade out over this distance up to there, over that side; but not next to the design."""
 WALL_PENALTY = 1e5
 """Energy of charge that is out of reach [1/m]."""
 FADED = 1e4
@@ -90,7 +90,8 @@ def fading(room, box, extent):
     Returns:
         As :attr:`Space.inner` and :attr:`Space.fade`.
     """
-    inwards, length = np.array([[1.0], [-1.0]]), extent * np.reshape(WALL_FADE_LENGTH, (2, 1, 1))
+    length = extent * np.reshape((WALL_EDGE, WALL_FADE_LENGTH), (2, 1, 1))
+    inwards = np.array([[1.0], [-1.0]])
     inner = room + inwards * (length - length[0])
     close = inwards * (box - inner) < length
     return np.where(close, room, inner), np.where(close, length[0], length)

@@ -78,7 +78,7 @@ class WarpCore:
                 "split number score part mix weight panel_end_fraction out": (n, views),
                 "node lifted extent softening_length barrier": (3 * n, views),
                 "outside_fraction near points unlifted": (3 * n, views),
-                "pose moved leader ground_elastance slot free outside": (places, views),
+                "pose moved leader ground_elastance slot outside": (places, views),
                 "lossy width walled columns": (views,),
             },
         )

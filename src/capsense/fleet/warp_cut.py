@@ -27,6 +27,7 @@ SOURCES = 16
 many = wp.types.vector(length=SOURCES, dtype=wp.float32)
 four = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 """Four points of a cluster."""
+five = wp.types.vector(length=5, dtype=wp.float32)
 
 _WIDTH = wp.constant(WIDTH)
 _NEAREST = wp.constant(1e-3)
@@ -119,8 +120,8 @@ class WarpActiveTree:
     mix: wp.array2d(dtype=wp.float32)  # the same in the functions solved for, see weigh, (n, v)
     weight: wp.array2d(dtype=wp.float32)
     barrier: wp.array2d(dtype=wp.float32)  # energy that keeps charge off [1/m], (l, v)
-    outside: wp.array2d(dtype=wp.vec4)  # what is out of reach: capacitance [m], middle, (b, v)
-    free: wp.array2d(dtype=wp.int32)  # whether a body is a conductor that is not at ground, (b, v)
+    # of conductors not at ground, what is out of reach: capacitance, middle; then 1, (b, v)
+    outside: wp.array2d(dtype=five)
     walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
     panel_end_fraction: wp.array2d(
@@ -356,6 +357,12 @@ def lift_back(force: wp.vec3, p: wp.vec3, gap: float, green: Response):
 
 
 @wp.func
+def is_free(cut: WarpActiveTree, b: int, v: int):
+    """1 of a conductor that is not at ground, else 0."""
+    return wp.where(cut.outside[b, v][4] > 0.0, 1, 0)
+
+
+@wp.func
 def off_walls(c: wp.vec3, free: int, green: Response):
     """How far a point is in what bodies fade out in, along each axis: minus before lower walls."""
     low = wp.cw_div(wp.max(green.walls[0, free, 0] - c, wp.vec3()), green.walls[1, free, 0])
@@ -410,8 +417,8 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpActiveTree):
         points[q] = wp.transform_point(cut.pose[b, v], scale * shapes.points[k, q])
     cut.unlifted[i, v] = points
     c = 0.5 * (points[0] + points[3])
-    off = off_walls(c, cut.free[b, v], green)
-    edge = wp.length(at_edges(off, cut.free[b, v], green))
+    off = off_walls(c, is_free(cut, b, v), green)
+    edge = wp.length(at_edges(off, is_free(cut, b, v), green))
     lifted = int(0)
     deep = float(0.0)
     if green.has_face != 0:

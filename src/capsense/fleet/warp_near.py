@@ -15,7 +15,15 @@ import warp as wp
 
 from capsense.field.green_kernels import Gap, Green, no_gap
 from capsense.field.soft import BODY
-from capsense.fleet.warp_cut import Places, Response, Shapes, WarpActiveTree, off_walls, smooth
+from capsense.fleet.warp_cut import (
+    Places,
+    Response,
+    Shapes,
+    WarpActiveTree,
+    five,
+    off_walls,
+    smooth,
+)
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import farthest_point, middle_height, nearest, reach_down
 from capsense.solver.gap.gap_kernels import EXACT, WAYS
@@ -134,7 +142,8 @@ def find_outside(shapes: Shapes, places: Places, green: Response, cut: WarpActiv
     """How much of conductors not at ground is out of reach, as ``network_kernels``."""
     b, v = wp.tid()
     e = v // places.hidden.shape[0]
-    cut.outside[b, v] = wp.vec4()
+    out = five()
+    cut.outside[b, v] = out
     u = places.choice[e, b]
     loose = places.neutral[e, b] != 0 or places.ground_elastance[e, b][0] > 0.0
     conducts = places.inverse_susceptibility[e, b] == wp.vec2()
@@ -154,7 +163,10 @@ def find_outside(shapes: Shapes, places: Places, green: Response, cut: WarpActiv
     if outside > 0.0:
         middle = middle / outside
         whole = scale * shapes.capacitance[u] * outside / shapes.charge[first]
-        cut.outside[b, v] = wp.vec4(whole, middle[0], middle[1], middle[2])
+        out[0] = whole
+        for i in range(3):
+            out[1 + i] = middle[i]
+        cut.outside[b, v] = out
 
 
 @wp.func
@@ -192,7 +204,6 @@ def connect(places: Places, cut: WarpActiveTree, terminals: int):
         leader = int(b)
         tie = places.ground_elastance[e, b]
         neutral = places.neutral[e, b]
-        cut.free[b, v] = 0
         if cut.node[o, v] >= 0:
             others = int(0)
             grounded = int(0)
@@ -213,7 +224,9 @@ def connect(places: Places, cut: WarpActiveTree, terminals: int):
                 tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
             conducts = places.inverse_susceptibility[e, b] == wp.vec2()
             if conducts and (neutral != 0 or tie[0] > 0.0):
-                cut.free[b, v] = 1
+                found = cut.outside[b, v]
+                found[4] = 1.0
+                cut.outside[b, v] = found
                 outside = outside_capacitance(places, cut, places.group[b], v)
                 if outside * _FLOATING_PENALTY > 1.0 and (neutral != 0 or tie[0] * outside > 1.0):
                     neutral = int(0)

@@ -18,6 +18,7 @@ from capsense.fleet.warp_cut import (
     at_edges,
     four,
     idle,
+    is_free,
     lift_back,
     off_box,
     off_walls,
@@ -78,7 +79,7 @@ def leaf_of(cut: WarpActiveTree, i: int, v: int):
     out.outside_fraction = cut.outside_fraction[i, v]
     out.near = cut.near[i, v]
     out.barrier = cut.barrier[i, v]
-    out.free = cut.free[body_of(cut, i), v]
+    out.free = is_free(cut, body_of(cut, i), v)
     return out
 
 

@@ -20,7 +20,7 @@ from capsense.viewer.plane import Plane
 if TYPE_CHECKING:
     from viser import ViserServer
 
-    from capsense.viewer.source import Frame
+    from capsense.viewer.frame import Frame
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]

@@ -6,7 +6,7 @@ import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from capsense.codec import design_from_json
 from capsense.errors import ProtocolError, RecordingError, ServerError
-from capsense.reading import Charges, Reading, StepStats
+from capsense.reading import Reading, StepStats
 from capsense.recording import GONE, reading_of
 from capsense.scenario import Channel, Scenario
 from capsense.scenario.model import Excitation, channels_of
-from capsense.scene import Body, Pose, Scene, Shape
+from capsense.scene import Body, Scene
 from capsense.server import DepthMessage, ReadingMessage
 from capsense.server.client import Client
 from capsense.server.messages import MessageTable, Open, read_open, read_scene
 from capsense.simulator import Simulator
+from capsense.viewer.frame import Frame
 from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
@@ -32,30 +33,6 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One instant: what stood where, and what the sensor read."""
-
-    index: int
-    """Number of the sample, from 0."""
-    time: float
-    """Its time [s]."""
-    scene: Scene
-    reading: Reading
-    plane: Plane | None = None
-    """Where potentials were asked for."""
-    potentials: Array | None = None
-    """Potentials at its points [V], shape (n, terminals)."""
-    charges: Charges | None = None
-    """On the bodies, where potentials were asked for."""
-    around: tuple[tuple[Shape, Pose], ...] = ()
-    """All solids of the robot's simulator in the sensor frame, where there is one; drawn in place
-    of the bodies. Of a skin, in the frame of the world."""
-    skin: Mapping[str, tuple[Pose, Array]] = field(default_factory=dict)
-    """Of a skin, name → where the sensor stands in the world, and changes of its electrodes' own
-    capacitances [F]."""
 
 
 class Source:

@@ -44,9 +44,11 @@ def forearm(env: Env, sensor: Any, radius: float) -> cs.Body:
 
 
 def test_a_forearm_reads_as_its_shape_does(env: Env, tiny_simulator: cs.Simulator) -> None:
-    """Differential: the limb alone is in reach; in a person's material, on a person's capacity."""
+    """Differential: the limb alone is in reach, the rest of the person has no charge there; in a
+    person's material, on a person's capacity."""
     sensor = cs.assistive_gym.attach(env, pose_in_link=NEAR, design=tiny_simulator, exclude=BESIDE)
-    assert names(sensor.scene()) == {"human/right_forearm"}
+    assert all(name.startswith("human/") for name in names(sensor.scene()))
+    assert "human/right_forearm" in names(sensor.scene())
     reading = sensor.read()
     tiny_simulator.reset()
     expected = tiny_simulator.step(cs.Scene([forearm(env, sensor, 0.033)])).delta
@@ -56,7 +58,8 @@ def test_a_forearm_reads_as_its_shape_does(env: Env, tiny_simulator: cs.Simulato
 
 
 def test_it_follows_resets(env: Env, tiny_simulator: cs.Simulator) -> None:
-    """Differential: another person in another client, and a readout that starts anew."""
+    """Differential: another person in another client, and a readout that starts anew. The waist of
+    the large one comes in at a corner of the domain: 0.13 %."""
     sensor = cs.assistive_gym.attach(
         env, pose_in_link=NEAR, design=tiny_simulator, readout="fdc1004", exclude=BESIDE
     )
@@ -73,7 +76,7 @@ def test_it_follows_resets(env: Env, tiny_simulator: cs.Simulator) -> None:
         assert counts > 0
         tiny_simulator.reset()
         expected = tiny_simulator.step(cs.Scene([forearm(env, sensor, radius)])).delta
-        assert reading.delta == approx(expected, rel=1e-3)
+        assert reading.delta == approx(expected, rel=2e-3)
 
 
 def test_every_link_of_the_person_has_its_limb(env: Env, tiny_simulator: cs.Simulator) -> None:
@@ -112,11 +115,13 @@ def test_materials_and_grounding_by_limb(env: Env) -> None:
     assert bodies["human/right_hand"].material.name == "wet skin"
     assert bodies["human/chest"].material.name == "human"
     others = [b.grounding for b in bodies.values() if b.grounding != "grounded"]
-    assert sum(others) == approx(100e-12)  # type: ignore[arg-type]
+    assert set(others) == {100e-12}
+    assert len({b.conductor for b in bodies.values() if b.grounding != "grounded"}) == 1
     owned = cs.assistive_gym.attach(env, materials={"human": "skin"}, grounding={"human": 5e-12})
     person = [body for body in owned.scene() if str(body.name).startswith("human/")]
     assert {body.material.name for body in person} == {"skin"}
-    assert sum(body.grounding for body in person) == approx(5e-12)
+    assert {body.grounding for body in person} == {5e-12}
+    assert len({body.conductor for body in person}) == 1
     with pytest.raises(cs.SceneError, match="nothing is named 'right_forarm'; did you mean"):
         cs.assistive_gym.attach(env, materials={"right_forarm": "skin"})
 

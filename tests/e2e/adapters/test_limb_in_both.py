@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from adapter_worlds import load
+from limb_models import bend_in_mujoco, load_in_pybullet
 
 import capsense as cs
 from capsense.humans import POSTURES, Limb, arm, person
@@ -44,18 +44,12 @@ def test_a_limb_reads_the_same(
     spec.worldbody.add_site(name="pad")
     model = spec.compile()
     data = mujoco.MjData(model)
-    for name, angle in bent.items():
-        data.joint(f"{limb.name}_{name}").qpos[0] = angle
-    mujoco.mj_forward(model, data)
+    bend_in_mujoco(mujoco, model, data, limb, bent)
     in_mujoco = cs.mujoco.attach(model, data, "pad", simulator)
 
     client = p.connect(p.DIRECT)
     try:
-        body = load(client, limb.urdf(), base, tmp_path)
-        for k in range(p.getNumJoints(body, physicsClientId=client)):
-            name = p.getJointInfo(body, k, physicsClientId=client)[1].decode()
-            angle = bent.get(name.removeprefix(f"{limb.name}_"), 0.0)
-            p.resetJointState(body, k, angle, physicsClientId=client)
+        load_in_pybullet(p, client, limb, base, bent, tmp_path)
         pad = p.createMultiBody(0, physicsClientId=client)
         in_pybullet = cs.pybullet.attach(
             client, pad, design=simulator, default_material="human",

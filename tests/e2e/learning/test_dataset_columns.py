@@ -123,7 +123,8 @@ def body_of(row: dict[str, Any], slot: int) -> cs.Body | None:
     grounding = {
         "capacitance": earth, "ties": Ties(earth, local) if 0 < earth < 1 else None
     }.get(one["grounding"], one["grounding"])  # fmt: skip
-    return cs.Body(shape, pose, matter, grounding)
+    conductor = row["body_conductor"][slot]
+    return cs.Body(shape, pose, matter, grounding, conductor=conductor)
 
 
 def text_of(count: int, seed: int = 3) -> str:

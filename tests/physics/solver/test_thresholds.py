@@ -43,7 +43,8 @@ def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold
 
 @pytest.mark.parametrize("name", NAMES)
 def test_converges_as_the_threshold_falls(name: str) -> None:
-    """Measured: errors and what is estimated both shrink with the threshold."""
+    """Measured: errors and what is estimated both shrink with the threshold; of what fades out at
+    a wall from 1.5 % on."""
     wanted = scenes()[name].solved().delta
     scale = wanted.max()
     errors, left = [], []
@@ -53,7 +54,7 @@ def test_converges_as_the_threshold_falls(name: str) -> None:
         left.append(np.abs(found.residual_correction).max() / scale)
     assert left == sorted(left, reverse=True)
     at_wall = "across" in name
-    assert errors[1] < (0.65 if at_wall else 0.45) * errors[0]
+    assert errors[1] < max((0.65 if at_wall else 0.45) * errors[0], 0.015 if at_wall else 0.0)
     assert errors[2] < (0.75 if at_wall else 0.55) * errors[1]
     assert errors[3] < 8e-4
     assert left[3] < 1e-3

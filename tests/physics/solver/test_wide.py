@@ -114,6 +114,7 @@ def test_impedances_of_wide_meshes_are_kept_in_files(tmp_path, monkeypatch):
 
     def anew() -> np.ndarray:
         store._SHAPES.clear()
+        store._IN_USE.clear()
         shape = cs.TriMesh(box.vertices, box.faces)
         made.append(store.functions_of(shape, 700, conducting=False, largest=0.1)[0])
         return made[-1].neumann_to_dirichlet

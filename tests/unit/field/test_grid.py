@@ -8,7 +8,7 @@ import surface_twin
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.field.face_kernels import WALL_FADE_LENGTH
+from capsense.field.face_kernels import WALL_EDGE
 from capsense.field.grid_kernels import (
     ALONG,
     GROWTH,
@@ -123,7 +123,7 @@ def test_potentials_of_a_design(design: str) -> None:
     """Differential: against the fitted charges, from 10 mm on, over a point's largest potential."""
     sim = cs.Simulator(design)
     green, background = sim._solver.green, sim.background.green
-    low, high = green.active_bounds + WALL_FADE_LENGTH * green.extent * np.array([[1.0], [-1.0]])
+    low, high = green.active_bounds + WALL_EDGE * green.extent * np.array([[1.0], [-1.0]])
     points = inside(500, low, high)
     points = points[points[:, 2] > green.box[1, 2] + 0.01]
     found = values_at(points, green.grid)[:, : green.terminals]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from approximate import approx
+from limb_models import bend_in_mujoco, check_geoms, check_ranges, load_in_pybullet
 
 import capsense as cs
 from capsense.errors import MissingDependencyError, SceneError
@@ -244,20 +245,15 @@ def test_mjcf_stands_as_the_limb_does(limb: Limb) -> None:
     model = mujoco.MjModel.from_xml_string(limb.mjcf(base))
     data = mujoco.MjData(model)
     angles = random_angles(limb, 2)
-    for name, angle in angles.items():
-        data.joint(f"{limb.name}_{name}").qpos[0] = angle
-    mujoco.mj_forward(model, data)
-    for body in limb.bodies(base, angles):
-        geom = data.geom(str(body.name))
-        assert geom.xpos == approx(np.array(body.pose.position), abs=1e-9)
-        axis = geom.xmat.reshape(3, 3)[:, 2]
-        assert abs(axis @ body.pose.rotation[:, 2]) == approx(1, abs=1e-9)
+    bend_in_mujoco(mujoco, model, data, limb, angles)
+    bodies = limb.bodies(base, angles)
+    check_geoms(data, bodies)
+    for body in bodies:
         size = model.geom(str(body.name)).size
         assert isinstance(body.shape, cs.Capsule)
         assert (size[0], 2 * size[1]) == approx((body.shape.radius, body.shape.length))
     assert model.body_mass.sum() == approx(sum(s.mass for s in limb.segments))
-    ranges = [model.joint(f"{limb.name}_{j.name}").range for j in limb.joints]
-    assert np.array(ranges) == approx(np.array([(j.lower, j.upper) for j in limb.joints]))
+    check_ranges(model, limb)
     pasted = f"<mujoco><worldbody>{mjcf_body(limb, base)}</worldbody></mujoco>"
     assert mujoco.MjModel.from_xml_string(pasted).nq == model.nq
 
@@ -266,21 +262,12 @@ def test_mjcf_stands_as_the_limb_does(limb: Limb) -> None:
 def test_urdf_stands_as_the_limb_does(limb: Limb, tmp_path: Path) -> None:
     """Differential: PyBullet's kinematics and shapes against ours, all joints bent."""
     p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
-    file = tmp_path / "limb.urdf"
-    file.write_text(limb.urdf())
     client = p.connect(p.DIRECT)
     try:
         base = cs.Pose((0.1, 0.2, 1.4), (0.1, 0.2, 0.3, 0.9))
-        body = p.loadURDF(
-            str(file), base.position, base.quaternion, useFixedBase=True, physicsClientId=client
-        )
         angles = random_angles(limb, 3)
-        links = {}
-        for k in range(p.getNumJoints(body, physicsClientId=client)):
-            info = p.getJointInfo(body, k, physicsClientId=client)
-            links[info[12].decode()] = k
-            name = info[1].decode().removeprefix(f"{limb.name}_")
-            p.resetJointState(body, k, angles[name], physicsClientId=client)
+        body, links = load_in_pybullet(p, client, limb, base, angles, tmp_path)
+        assert len(links) == len(limb.joints)
         where = limb.forward(angles)
         for segment in limb.segments:
             link = links[f"{limb.name}_{segment.name}"]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from approximate import approx
+from limb_models import bend_in_mujoco, check_geoms, check_ranges, load_in_pybullet
 
 import capsense as cs
 from capsense.errors import SceneError
@@ -274,24 +275,15 @@ def test_mjcf_of_a_person(hands: Any) -> None:
     base = limb.on_floor(POSTURES["standing"], turn=(0.1, 0.2, 0.3, 0.9))
     model = mujoco.MjModel.from_xml_string(limb.mjcf(base, free=True))
     data = mujoco.MjData(model)
-    for name, angle in POSTURES["standing"].items():
-        data.joint(f"person_{name}").qpos[0] = angle
-    mujoco.mj_forward(model, data)
+    bend_in_mujoco(mujoco, model, data, limb, POSTURES["standing"])
     assert data.ncon == 0
     rng = np.random.default_rng(8)
     angles = {j.name: float(rng.uniform(j.lower, j.upper)) for j in limb.joints}
-    for name, angle in angles.items():
-        data.joint(f"person_{name}").qpos[0] = angle
-    mujoco.mj_forward(model, data)
-    for body in limb.bodies(base, angles):
-        geom = data.geom(str(body.name))
-        assert geom.xpos == approx(np.array(body.pose.position), abs=1e-9)
-        axis = geom.xmat.reshape(3, 3)[:, 2]
-        assert abs(axis @ body.pose.rotation[:, 2]) == approx(1, abs=1e-9)
+    bend_in_mujoco(mujoco, model, data, limb, angles)
+    check_geoms(data, limb.bodies(base, angles))
     assert model.body_mass.sum() == approx(Build("female").mass, rel=1e-3)
     assert model.nq == 7 + len(limb.joints)
-    ranges = [model.joint(f"person_{j.name}").range for j in limb.joints]
-    assert np.array(ranges) == approx(np.array([(j.lower, j.upper) for j in limb.joints]))
+    check_ranges(model, limb)
     fixed = mujoco.MjModel.from_xml_string(limb.mjcf(base))
     assert fixed.nq == len(limb.joints)
     for alone in (arm(), hand()):
@@ -304,25 +296,13 @@ def test_urdf_of_a_person(hands: Any, tmp_path: Path) -> None:
     """Differential: PyBullet's kinematics, all joints bent; links below its limit of 127."""
     p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
     limb = person(hands=hands)
-    file = tmp_path / "person.urdf"
-    file.write_text(limb.urdf())
     client = p.connect(p.DIRECT)
     try:
         base = cs.Pose((0.1, 0.2, 1.4), (0.1, 0.2, 0.3, 0.9))
-        body = p.loadURDF(
-            str(file), base.position, base.quaternion, useFixedBase=True, physicsClientId=client
-        )
         rng = np.random.default_rng(9)
         angles = {j.name: float(rng.uniform(j.lower, j.upper)) for j in limb.joints}
-        links = {}
-        count = p.getNumJoints(body, physicsClientId=client)
-        assert count < 128
-        for k in range(count):
-            info = p.getJointInfo(body, k, physicsClientId=client)
-            links[info[12].decode()] = k
-            name = info[1].decode().removeprefix("person_")
-            if name in angles:
-                p.resetJointState(body, k, angles[name], physicsClientId=client)
+        body, links = load_in_pybullet(p, client, limb, base, angles, tmp_path)
+        assert p.getNumJoints(body, physicsClientId=client) < 128
         where = limb.forward(angles)
         for segment in limb.segments:
             link = links[f"person_{segment.name}"]

@@ -110,7 +110,7 @@ def test_a_ball_around_a_source_feels_no_force_of_it() -> None:
     place = sources[np.argmin(np.linalg.norm(sources - middle, axis=1))]
     bodies = pack(Placed(cs.Sphere(0.5 * green.levels[0].least), tuple(place.tolist())))
     solution = solve(bodies, green, 0.015, 2.5, True)
-    wanted = gradient_twin.jacobian(solution, bodies["position"], green)
+    wanted = gradient_twin.jacobian(solution, bodies, green)
     assert _apart(jacobian(solution, bodies, green), wanted) < 1e-5
 
 

@@ -11,14 +11,8 @@ namespace CapSense
     /// Needs the package com.unity.xr.hands; without it this assembly is left out.
     /// </remarks>
     [AddComponentMenu("CapSense/Capacitive Sensor of Hands")]
-    public sealed class CapSenseHands : MonoBehaviour
+    public sealed class CapSenseHands : ServedSensor
     {
-        [Tooltip("Address of the server: capsense serve --design six_patch")]
-        public string url = "ws://127.0.0.1:8765";
-        [Tooltip("What the server asks for; empty without a token")]
-        public string token = "";
-        [Tooltip("Design that the server serves; empty for its first")]
-        public string design = "";
         [Tooltip("The XR Origin's camera offset, which tracked poses are relative to; none: the world")]
         public Transform origin;
         [Tooltip("female or male: whose hands they are")]
@@ -27,73 +21,31 @@ namespace CapSense
         public float stature;
         [Tooltip("Whether the device reports fingertips on the skin, not inside as OpenXR says")]
         public bool tipsOnSkin;
-        [Tooltip("Frames a second; 0: every frame")]
-        public float rate;
 
         private readonly List<XRHandSubsystem> found = new List<XRHandSubsystem>();
         private readonly HandJoints left = new HandJoints(), right = new HandJoints();
-        private CapSenseClient client;
-        private RemoteSensor remote;
-        private float next;
-        private bool refused;
-
-        /// <summary>The newest reading; null before the first.</summary>
-        public Reading Reading { get; private set; }
-
-        /// <summary>Raised on Unity's own thread with every new reading.</summary>
-        public event System.Action<Reading> Received;
-
-        /// <summary>The sensor on the server: electrode names, baseline, errors.</summary>
-        public RemoteSensor Remote { get { return remote; } }
-
-        /// <summary>Where the connection stands.</summary>
-        public ClientState State { get { return client == null ? ClientState.Stopped : client.State; } }
 
         private void OnEnable()
         {
-            try
-            {
-                client = new CapSenseClient(url, token);
-            }
-            catch (System.ArgumentException error)
-            {
-                client = null;
-                Debug.LogError("CapSense: " + error.Message, this);
-                return;
-            }
             var build = new Dictionary<string, object> { ["sex"] = sex };
             if (stature > 0) build["stature"] = stature;
-            remote = client.Add(new SensorOptions
+            Open(new SensorOptions
             {
                 Design = design,
                 Material = "human",
                 PersonCapacitance = 100e-12,
                 Hands = new Dictionary<string, object> { ["build"] = build },
             });
-            client.Start();
         }
 
         private void OnDisable()
         {
-            if (client != null) client.Dispose();
-            client = null;
+            Close();
         }
 
         private void LateUpdate()
         {
-            if (client == null) return;
-            Reading newest;
-            if (remote.TryTake(out newest))
-            {
-                Reading = newest;
-                if (Received != null) Received(newest);
-            }
-            if (!refused && client.State == ClientState.Refused)
-                Debug.LogError("CapSense: " + client.LastError.Message, this);
-            refused = client.State == ClientState.Refused;
-            if (!remote.Idle || Time.time < next) return;
-            next = rate > 0 ? Mathf.Max(next + 1 / rate, Time.time) : 0;
-            remote.Submit(Take(Time.timeAsDouble));
+            if (Poll()) Remote.Submit(Take(Time.timeAsDouble));
         }
 
         /// <summary>The hands at present; none without a running hand subsystem.</summary>

@@ -92,8 +92,9 @@ def tie_what_is_outside(bodies, space):
     the domain reaches as far or not.
     """
     for b in range(bodies.shape[0]):
-        group = bodies[b].group
-        first = bodies[b].free != 0
+        if bodies[b].free == 0:
+            continue
+        group, first = bodies[b].group, True
         for c in range(b):
             first = first and bodies[c].group != group
         found = outside_capacitance(bodies, group, space) if first else 0.0
