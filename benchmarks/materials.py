@@ -1,7 +1,7 @@
 """The packaged materials, as the table of the docs.
 
-    python benchmarks/materials.py                              # print the table
-    python benchmarks/materials.py --write docs/materials.md    # replace the one of the page
+python benchmarks/materials.py                              # print the table
+python benchmarks/materials.py --write docs/materials.md    # replace the one of the page
 """
 
 from __future__ import annotations
