@@ -76,7 +76,7 @@ def test_commands_are_copied_without_prompts(site: str, browser: Any) -> None:
     page = context.new_page()
     page.goto(f"{site}/viewer/")
     copied = []
-    for block in (".language-console", ".language-python"):
+    for block in (".highlight:has(.gp)", ".highlight:not(:has(.gp))"):
         page.locator(f"{block} button[data-md-type=copy]").first.click()
         copied.append(page.evaluate("navigator.clipboard.readText()"))
     console, python = copied
