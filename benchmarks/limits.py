@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from step_scenes import PIXELS, WIDE, low, sheet
+from step_scenes import PIXELS, WIDE, low
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
@@ -196,22 +196,6 @@ def images(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
             yield f"{name}, eps_r {eps:g}", out
 
 
-def cloth(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
-    """Errors of level sheets 120 × 100 mm at 5, 10, 20, 50 mm."""
-    vertices, faces = sheet()
-    for thickness in (0.001, 0.003):
-        for eps in (2.0, 5.0):
-            material, out = cs.Material("cloth", eps_r=eps), []
-            for gap in (0.005, 0.01, 0.02, 0.05):
-                z = gap + thickness / 2
-                box = cs.Body(cs.Box((0.12, 0.10, thickness)), cs.Pose((0, 0, z)), material)
-                level = np.column_stack([vertices[:, :2], np.full(len(vertices), z)])
-                soft = cs.DeformableSurface(level, faces, thickness=thickness, material=material)
-                truth = sim.step(cs.Scene([box])).delta
-                out.append(apart(sim.step(cs.Scene([soft.body()])).delta, truth))
-            yield f"{1e3 * thickness:g} mm, eps_r {eps:g}", out
-
-
 def inside(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     """Error estimates over the largest entry, lowest points at 1, 0, -1, -5 mm."""
     for name, (shape, turn) in BODIES.items():
@@ -261,7 +245,6 @@ PARTS = {
     "a person's arm: rms and largest error, presets fast and standard": person,
     "a figure of one skin: presets fast, standard, fine": skin,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
-    "deforming sheets of dielectrics, gaps of 5, 10, 20, 50 mm": cloth,
     "in the sensor: error estimate with lowest points at 1, 0, -1, -5 mm": inside,
 }
 

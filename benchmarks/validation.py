@@ -295,7 +295,7 @@ def main() -> None:
         elements=elements(out / "peers_bem.json"),
         contact=limited("contact", *PRESETS, "2,800 panels"),
         wide=limited("wide", *(f"{p}: {x}" for p in PRESETS for x in ("median", "worst", "told"))),
-        images=limited("images", *GAPS), cloth=limited("cloth", *GAPS),
+        images=limited("images", *GAPS),
         skin=limited("skin", *PRESETS),
         inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),
         studies=studies(reproduced), foretold=foretold(),

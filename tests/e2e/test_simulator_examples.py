@@ -50,6 +50,23 @@ def test_forearm(
     assert len(lines) == 1 + -(-len(record.time) // 10)
 
 
+def test_washcloth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A cloth comes into contact with the skin; a wet one adds more than a dry one."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    module = example("washcloth", monkeypatch)
+    monkeypatch.setattr(module, "RATE", 2.0)
+    monkeypatch.setattr(sys, "argv", ["washcloth.py", str(tmp_path)])
+    module.main()
+    lines = capsys.readouterr().out.splitlines()
+    readings, touched = (int(n) for n in re.findall(r"\d+", lines[0]))
+    assert readings > touched > readings // 4
+    none, dry, wet = (float(re.findall(r"([\d.]+) pF", line)[0]) for line in lines[1:])
+    assert none < dry < wet
+    assert (tmp_path / "washcloth.png").stat().st_size > 10_000
+
+
 def test_sleeve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An arm is felt through cotton that moves; the example checks itself and draws a plot."""
     monkeypatch.syspath_prepend(str(ROOT / "examples"))

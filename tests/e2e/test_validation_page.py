@@ -112,7 +112,7 @@ def test_designs(validation: ModuleType, only: str, count: int) -> None:
 @pytest.mark.parametrize(
     ("part", "columns", "lines", "bound"),
     [
-        ("contact", 4, 7, 50), ("wide", 9, 1, 70), ("images", 4, 6, 20), ("cloth", 4, 4, 35),
+        ("contact", 4, 7, 50), ("wide", 9, 1, 70), ("images", 4, 6, 20),
         ("inside", 4, 5, 1000), pytest.param("wide", 9, 5, 70, marks=pytest.mark.slow),
     ],
 )  # fmt: skip

@@ -12,4 +12,5 @@ from capsense.solver.placement.placement_kernels import ActiveClusters
 def plain_leaves(*fields: Any) -> ActiveClusters:
     """Leaves from their fields ``points`` to ``within``."""
     count = len(fields[0])
-    return ActiveClusters(*fields, np.full((count, 2), -1), np.ones(count), np.zeros(count))
+    offset, barrier = np.zeros((count, 3)), np.zeros(count)
+    return ActiveClusters(*fields, np.full((count, 2), -1), np.ones(count), offset, barrier)

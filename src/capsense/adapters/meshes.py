@@ -276,3 +276,77 @@ def _hull(vertices: Array, label: str) -> tuple[Array, Array]:
         raise UnusableShape(f"{label!r} has no convex hull with a volume: {reason}") from None
     kept = np.unique(hull.simplices)
     return vertices[kept], np.searchsorted(kept, hull.simplices)
+
+
+_SIDES = 8
+"""Sides of the tube that stands for a cable."""
+
+
+def tube(points: Array, radius: float, sides: int = _SIDES) -> Array:
+    """Vertices of a tube along a line, of the cross-section of a round one.
+
+    Rings are carried from point to point without twist (the double reflection of Wang et al.,
+    *Computation of Rotation Minimizing Frames*, ACM Transactions on Graphics 27, 2008), so that
+    they move smoothly with the points.
+
+    Args:
+        points: Points of the line [m], shape (n, 3), at least two.
+        radius: Of the round cross-section [m].
+        sides: How many flat sides it has.
+
+    Returns:
+        Shape (n * sides + 2, 3): the rings, then the middles of both ends.
+    """
+    n = len(points)
+    way = np.gradient(points, axis=0)
+    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-300)
+    across = np.empty((n, 3))
+    across[0] = np.eye(3)[np.abs(way[0]).argmin()]
+    across[0] -= (across[0] @ way[0]) * way[0]
+    across[0] /= np.linalg.norm(across[0])
+    for k in range(n - 1):
+        first = points[k + 1] - points[k]
+        size = max(float(first @ first), 1e-300)
+        left = across[k] - 2 / size * (first @ across[k]) * first
+        turned = way[k] - 2 / size * (first @ way[k]) * first
+        second = way[k + 1] - turned
+        size = max(float(second @ second), 1e-300)
+        across[k + 1] = left - 2 / size * (second @ left) * second
+    angle = 2 * math.pi / sides * np.arange(sides)
+    reach = radius * math.sqrt(angle[1] / math.sin(angle[1]))  # of equal area
+    other = np.cross(way, across)
+    ring = np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * other[:, None]
+    rings = points[:, None] + reach * ring
+    return np.concatenate([rings.reshape(-1, 3), points[[0, -1]]])
+
+
+def tube_faces(count: int, sides: int = _SIDES) -> Faces:
+    """Triangles of :func:`tube` along ``count`` points, shape (2 count sides, 3)."""
+    a = np.arange(count * sides).reshape(count, sides)
+    low, high = a[:-1], a[1:]
+    low_next, high_next = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
+    parts = [
+        np.stack([low, low_next, high_next], axis=-1).reshape(-1, 3),
+        np.stack([low, high_next, high], axis=-1).reshape(-1, 3),
+    ]
+    for ring, middle, way in ((a[0], count * sides, -1), (a[-1], count * sides + 1, 1)):
+        parts.append(np.stack([np.full(sides, middle), np.roll(ring, way), ring], axis=-1))
+    return np.concatenate(parts)
+
+
+def path_order(lines: NDArray[np.integer[Any]]) -> NDArray[np.int64] | None:
+    """Points of line segments (n, 2) from end to end; None where they are no open path."""
+    beside: dict[int, list[int]] = {}
+    for a, b in lines.tolist():
+        beside.setdefault(a, []).append(b)
+        beside.setdefault(b, []).append(a)
+    ends = [k for k, others in beside.items() if len(others) == 1]
+    if len(ends) != 2 or len(beside) != len(lines) + 1:
+        return None
+    order = [min(ends)]
+    while len(order) < len(beside):
+        ahead = [k for k in beside[order[-1]] if len(order) == 1 or k != order[-2]]
+        if len(ahead) != 1:
+            return None
+        order.append(ahead[0])
+    return np.array(order, dtype=np.int64)

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from capsense.adapters import WorldSource
 from capsense.adapters.contacts import Contact
-from capsense.adapters.meshes import Terrain, primitive, solid_mesh, terrain_shape
+from capsense.adapters.meshes import (
+    Terrain,
+    path_order,
+    primitive,
+    solid_mesh,
+    terrain_shape,
+    tube,
+    tube_faces,
+)
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
@@ -44,6 +52,20 @@ class FlexVertices:
 
     def __call__(self) -> Array:
         return self.data.flexvert_xpos[self.own]
+
+
+@dataclass(frozen=True, eq=False)
+class CableVertices:
+    """Gives the vertices of the tube that stands for a flex of lines at present."""
+
+    line: FlexVertices
+    order: NDArray[np.int64]
+    """Its vertices from one end to the other."""
+    radius: float
+    """[m]"""
+
+    def __call__(self) -> Array:
+        return tube(self.line()[self.order], self.radius)
 
 
 class ModelReader:
@@ -127,28 +149,35 @@ class ModelReader:
             data: The state that its vertices are taken from.
 
         Raises:
-            SceneError: The flex is a cable, which has no surface.
+            SceneError: The flex is of lines that form no single open path.
         """
         names, m = self._flex_names[flex], self.model
         if self.rules.excludes(names):
             return None
         label, kind = names[0], int(m.flex_dim[flex])
+        faces: NDArray[Any]
         if kind == 2:
             faces = _part(m.flex_elem, m.flex_elemdataadr[flex], 3 * int(m.flex_elemnum[flex]))
         elif kind == 3:
             faces = _part(m.flex_shell, m.flex_shelldataadr[flex], 3 * int(m.flex_shellnum[flex]))
-        else:
-            raise SceneError(
-                f"flex {label!r} is a cable, which cannot be sensed; leave it out with "
-                f"exclude=[{label!r}]"
-            )
         first = int(m.flex_vertadr[flex])
-        own = slice(first, first + int(m.flex_vertnum[flex]))
+        vertices: FlexVertices | CableVertices
+        vertices = FlexVertices(data, slice(first, first + int(m.flex_vertnum[flex])))
+        if kind == 1:
+            lines = _part(m.flex_elem, m.flex_elemdataadr[flex], 2 * int(m.flex_elemnum[flex]))
+            order = path_order(lines.reshape(-1, 2))
+            if order is None:
+                raise SceneError(
+                    f"flex {label!r} is of lines that branch, part or close, where a cable is one "
+                    f"open path; leave it out with exclude=[{label!r}]"
+                )
+            vertices = CableVertices(vertices, order, max(float(m.flex_radius[flex]), _THINNEST))
+            faces = tube_faces(len(order))
         material, tie = self._matter(names)
         return SoftSolid(
             label=label,
             faces=faces.reshape(-1, 3).astype(np.int64),
-            vertices=FlexVertices(data, own),
+            vertices=vertices,
             material=material,
             tie=tie,
             thickness=max(2 * float(m.flex_radius[flex]), _THINNEST),

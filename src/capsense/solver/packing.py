@@ -20,7 +20,7 @@ from capsense.scene.shapes import Shape
 from capsense.solver.bodies.outline import CHANGING, write_triangles
 from capsense.solver.gap.gap_kernels import REACH
 from capsense.solver.gap.touch import Pressed
-from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.dynamic_surface import DipoleLayer, DynamicBody
 from capsense.solver.tree.matter import Matter
 from capsense.solver.tree.near_triangles import Face, near_triangles
 from capsense.solver.tree.rigid import BODY, RigidShape
@@ -105,6 +105,17 @@ class BodyTemplate:
     @cached_property
     def _bytes(self) -> bytes:
         return self.records.tobytes()
+
+
+def layer_of(
+    found: tuple[RigidShape | DynamicBody, float], conducting: bool
+) -> list[tuple[DipoleLayer, float]]:
+    """The dipoles that go with the charges of a thin sheet of triangles, if it is one."""
+    body, size = found
+    if conducting or not isinstance(body, DynamicBody) or body.sheet == 0.0:
+        return []
+    known = body.pieces is not None and body.pieces.normals is not None
+    return [(DipoleLayer(body), size)] if known else []
 
 
 def make_template(

@@ -30,7 +30,14 @@ from capsense.solver.bodies.panels import longer, windowed
 from capsense.solver.gap.gap_kernels import extent_of_body
 from capsense.solver.gap.touch import CoverContact, Pressed
 from capsense.solver.gap.touch_kernels import no_foundation
-from capsense.solver.packing import BodyTemplate, PackedBodies, View, make_template, same
+from capsense.solver.packing import (
+    BodyTemplate,
+    PackedBodies,
+    View,
+    layer_of,
+    make_template,
+    same,
+)
 from capsense.solver.system.lossy import solve_lossy
 from capsense.solver.system.network_kernels import tie_what_is_outside
 from capsense.solver.system.step import (
@@ -519,9 +526,11 @@ class SurfaceSolver:
             if at is not None:
                 offsets.append((len(places), at))
             for part in parts:
-                found.append(self.functions_of(part, conducting[place], share))
-                solved.append(part)
-                places.append(place)
+                made = self.functions_of(part, conducting[place], share)
+                for body in (made, *layer_of(made, conducting[place])):
+                    found.append(body)
+                    solved.append(part)
+                    places.append(place)
         if laid is None or (laid.places, laid.found) != (places, found):
             laid = make_template(matter, places, found)
         whole = [body.measured_in(self.length) for body in bodies]

@@ -135,20 +135,55 @@ def test_a_solid_flex_is_filled(tiny_simulator: cs.Simulator) -> None:
     assert np.diag(found.delta) == approx(np.diag(box.delta), rel=0.03, abs=0)
 
 
-def test_flexes_are_excluded_and_refused_by_name(tiny_simulator: cs.Simulator) -> None:
-    """A cable has no surface; names are known to the patterns."""
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+def test_flexes_are_excluded_by_name(tiny_simulator: cs.Simulator) -> None:
+    """Names are known to the patterns."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
     assert len(cloth_in_mujoco(tiny_simulator, exclude=["clo*"]).scene()) == 0
     with pytest.raises(cs.SceneError, match="nothing is named 'cloht'; did you mean 'cloth'"):
         cloth_in_mujoco(tiny_simulator, materials={"cloht": "cotton"})
+
+
+def cable_in_mujoco(simulator: cs.Simulator, elements: str) -> Any:
+    """A flex of five points and some lines, 30 mm in front of a sensor."""
+    import mujoco
+
+    points = " ".join(f"{0.015 * k - 0.03} 0 .03" for k in range(5))
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><geom size=".01"/><site name="pad"/></body>'
-        '<flexcomp name="cable" type="grid" count="5 1 1" spacing=".01 .01 .01" dim="1">'
-        '<edge equality="true"/></flexcomp>'
-        "</worldbody></mujoco>"
+        f'<flexcomp name="cable" type="direct" dim="1" radius=".004" mass=".1" point="{points}" '
+        f'element="{elements}"><edge equality="true"/></flexcomp></worldbody></mujoco>'
     )
-    with pytest.raises(cs.SceneError, match=r"'cable' is a cable.*exclude="):
-        cs.mujoco.attach(model, mujoco.MjData(model), "pad", tiny_simulator)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    simulator.reset()
+    return cs.mujoco.attach(model, data, "pad", simulator)
+
+
+def test_a_straight_cable_reads_as_a_rod(tiny_simulator: cs.Simulator) -> None:
+    """Differential: within 5 % of a cylinder of its radius; it follows its points."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    sensor = cable_in_mujoco(tiny_simulator, "0 1 1 2 2 3 3 4")
+    (body,) = sensor.scene()
+    assert body.shape.closed
+    np.testing.assert_allclose(body.shape.volume, np.pi * 0.004**2 * 0.06, rtol=1e-3)
+    tiny_simulator.reset()
+    rod = cs.Body(cs.Cylinder(0.004, 0.06), cs.Pose.from_euler((0, 0, 0.03), (0, np.pi / 2, 0)))
+    wanted = tiny_simulator.step(cs.Scene([rod])).delta
+    found = sensor.read().delta
+    np.testing.assert_allclose(np.diag(found), np.diag(wanted), rtol=0.05)
+    sensor.data.qpos[2::3] -= 0.01
+    import mujoco
+
+    mujoco.mj_forward(sensor.model, sensor.data)
+    assert sensor.read().delta[0, 0] > 1.1 * found[0, 0]
+
+
+@pytest.mark.parametrize("elements", ["0 1 1 2 1 3 3 4", "0 1 2 3 3 4", "0 1 1 2 2 0 3 4"])
+def test_lines_that_are_no_path_are_refused(tiny_simulator: cs.Simulator, elements: str) -> None:
+    """Hostile: the error names the flex and the way out."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    with pytest.raises(cs.SceneError, match=r"'cable' is of lines that branch.*exclude="):
+        cable_in_mujoco(tiny_simulator, elements)
 
 
 def test_a_soft_sheet_reads_as_a_plate(

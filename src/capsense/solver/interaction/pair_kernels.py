@@ -23,6 +23,7 @@ from capsense._simd import (
     wide_splat,
 )
 from capsense.field.face_kernels import on_face, smooth
+from capsense.solver.interaction.layer_kernels import charged
 from capsense.solver.tree.mean_kernels import (
     add_line,
     add_means,
@@ -110,7 +111,7 @@ def _add_lifted(leaves, flat, line, room, out):
         for q in range(4):
             for k in range(3):
                 if abs(points[i, q, k] - true[i, q, k]) > LIFTED:
-                    lifted[i] = leaves.self_interaction_weight[i] == 0.0
+                    lifted[i] = leaves.self_interaction_weight[i] == 0.0 and charged(leaves, i)
         some = some or lifted[i]
     if not some:
         return
@@ -143,6 +144,8 @@ def bound_images(leaves, rows, pairs, green):
         return
     points, image, face = leaves.points, np.empty((4, 3)), green.gap.face[1, 2]
     for j in range(points.shape[0]):
+        if not charged(leaves, j):
+            continue
         inverse, lowest = 0.0, math.inf
         for q in range(4):
             p = points[j, q]

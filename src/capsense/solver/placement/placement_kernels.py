@@ -32,6 +32,7 @@ from capsense._simd import (
 )
 from capsense.field.face_kernels import barrier, keep_off, out_of_reach
 from capsense.field.green_kernels import distances, level_share, source_potentials
+from capsense.solver.selection.evaluation_kernels import put_offset
 from capsense.solver.tree.mean_kernels import extent_of, quadrature4
 
 
@@ -57,6 +58,8 @@ class ActiveClusters(NamedTuple):
     """Rows in a table of means of 1/r within a body, -1 for none, and where it stands, (l, 2)."""
     size: NDArray[Any]
     """How many times as large as in such a table the body of each is, shape (l,)."""
+    offset: NDArray[Any]
+    """From the middle of a layer of dipoles to its front [m]; zero of charges; shape (l, 3)."""
     barrier: NDArray[Any]
     """Energy that keeps charge off each that is out of reach, see ``face_kernels.barrier`` [1/m],
     shape (l,)."""
@@ -68,7 +71,8 @@ def placed(bodies, cut, green):
     n = cut.active.shape[0]
     leaves = ActiveClusters(
         np.empty((n, 4, 3)), np.empty((n, 4, 3)), np.empty(n), np.empty(n), np.empty(n),
-        np.empty(n, np.int64), np.zeros(n), np.full((n, 2), -1), np.empty(n), np.empty(n),
+        np.empty(n, np.int64), np.zeros(n), np.full((n, 2), -1), np.empty(n), np.zeros((n, 3)),
+        np.empty(n),
     )  # fmt: skip
     _fill_leaves(bodies, cut, green, leaves, (np.empty((3, 3)), np.empty((3, 3)), np.empty(3)))
     return leaves
@@ -86,7 +90,9 @@ def _fill_leaves(bodies, cut, green, leaves, room):
         leaves.owner[j], leaves.size[j] = cut.body[a], body.scale
         if k < body.top:
             leaves.table_rows[j, 0], leaves.table_rows[j, 1] = k, body.means
-        if body.potential_coefficients == 0:  # clusters meet each other at every step
+        if body.layer > 0.0:  # its dipoles do not meet each other, see ``layers``
+            put_offset(body, k, body.layer, leaves.offset[j])
+        elif body.potential_coefficients == 0:  # clusters meet each other at every step
             leaves.self_interaction_weight[j] = 1.0 + body.inside * body.inverse_susceptibility
         if body.points == 0:
             spread, center = doubles(body.spread), doubles(body.center)

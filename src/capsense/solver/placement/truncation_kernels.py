@@ -54,7 +54,8 @@ def truncate_to_domain(cut, leaves):
     points, true = np.empty((kept, 4, 3)), np.empty((kept, 4, 3))
     extent, soft, beyond, within = np.empty(kept), np.empty(kept), np.empty(kept), np.empty(kept)
     owner, at = np.empty(kept, np.int64), np.empty(kept, np.int64)
-    known, size, barrier = np.empty((kept, 2), np.int64), np.empty(kept), np.empty(kept)
+    known, size, offset = np.empty((kept, 2), np.int64), np.empty(kept), np.empty((kept, 3))
+    barrier = np.empty(kept)
     i = 0
     for j in range(n):
         a = cut.active[j]
@@ -71,6 +72,8 @@ def truncate_to_domain(cut, leaves):
             owner[i], within[i] = leaves.owner[j], leaves.self_interaction_weight[j]
             known[i, 0], known[i, 1] = leaves.table_rows[j, 0], leaves.table_rows[j, 1]
             size[i], barrier[i] = leaves.size[j], leaves.barrier[j]
+            for k in range(3):
+                offset[i, k] = leaves.offset[j, k]
             i += 1
     return (
         ActiveTree(
@@ -86,7 +89,9 @@ def truncate_to_domain(cut, leaves):
             there,
             at,
         ),
-        ActiveClusters(points, true, extent, soft, beyond, owner, within, known, size, barrier),
+        ActiveClusters(
+            points, true, extent, soft, beyond, owner, within, known, size, offset, barrier
+        ),
     )
 
 

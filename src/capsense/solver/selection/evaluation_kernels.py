@@ -33,6 +33,9 @@ _FREED = 20.0
 _BEHIND = 4e-3
 """So far behind its face [m] a flat design leaves functions all of their energy: many of them among
 its sources would leave no definite matrix."""
+_ARM = 0.2
+"""Faces of a layer of dipoles count as at least so far apart, over the extent of a cluster, where
+its functions are scored."""
 _CLOSE = 8e-3, 12e-3
 """Within the first distance from a flat design [m] potentials are those of its charges, beyond the
 second those of the table."""
@@ -177,9 +180,44 @@ def look(body, green, coarser, looks, start):
     stop, found = _look_into(
         body, green, coarser, looks, start, (points, places, inner, np.empty(3))
     )
-    far_potentials(points[:found], places[:found], inner, green, looks.means)
+    if body.layer > 0.0:
+        _layer_potentials(body, green, looks, points[:found], places[:found], inner)
+    else:
+        far_potentials(points[:found], places[:found], inner, green, looks.means)
     _make_up(body, start, stop, looks)
     return stop
+
+
+@kernel
+def put_offset(body, k, thickness, out):
+    """Half of a thickness [m] along the mean normal of cluster k of a layer, shape (3,)."""
+    normals, half = doubles(body.normals), 0.5 * body.scale * thickness
+    for i in range(3):
+        out[i] = 0.0
+        for q in range(3):
+            out[i] += half * body.rotation[i, q] * normals[3 * k + q]
+
+
+@compiled
+def _layer_potentials(body, green, looks, points, places, share):
+    """As :func:`far_potentials`, of a layer of dipoles: the difference across it."""
+    extent, off, count = doubles(body.extent), np.empty(3), points.shape[0]
+    front, back, factor = points.copy(), points.copy(), np.empty(count, np.float32)
+    for j in range(count):
+        k = looks.node[places[j]]
+        arm = max(body.layer, _ARM * extent[k])  # the table does not resolve thin layers
+        factor[j] = body.layer / arm
+        put_offset(body, k, arm, off)
+        for i in range(3):
+            front[j, i] += off[i]
+            back[j, i] -= off[i]
+    other = np.zeros_like(looks.means)
+    far_potentials(front, places, share, green, looks.means)
+    far_potentials(back, places, share, green, other)
+    for j in range(count):
+        row = places[j]
+        for i in range(looks.means.shape[1]):
+            looks.means[row, i] = factor[j] * (looks.means[row, i] - other[row, i])
 
 
 @kernel

@@ -36,6 +36,8 @@ _WIDE = 0.08, 0.12
 """Clusters come to be large between these extents [m]."""
 
 
+_LAYERS = 0.25
+"""What scores of dipoles count for."""
 _USUAL = 0.015
 """Threshold up to which clusters are looked into as far as they usually are."""
 
@@ -105,7 +107,8 @@ def _energy(body, k):
 @kernel
 def _net_energy(body):
     """Energy of a body's net charge [1/m]."""
-    return doubles(body.own)[0] / body.scale + body.ground_elastance
+    inside = 1.0 + body.polarization_stiffness if body.layer > 0.0 else 1.0
+    return inside * doubles(body.own)[0] / body.scale + body.ground_elastance
 
 
 @kernel
@@ -119,6 +122,8 @@ def _own_score(body, looks, row, weight):
     for i in range(weight.shape[0]):
         d = float(looks.means[x, i] - looks.means[x + 1, i])
         value += weight[i] * d * d
+    if body.layer > 0.0:  # those left out are added in the field of the design
+        return _LAYERS * value / _energy(body, looks.node[row])
     return value / (_energy(body, looks.node[row]) * looks.screening_factor[row] ** 3)
 
 

@@ -12,7 +12,8 @@ from capsense.field.green_kernels import Green
 from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.gap.gap_kernels import fabric_change, near_bodies, press_out
 from capsense.solver.gap.series_kernels import in_series_lossy
-from capsense.solver.system.step import NOTHING, SERIES, Solution, estimate, prepared, solve_lifted
+from capsense.solver.interaction.layer_kernels import face_charges, faces_of, fine_layers
+from capsense.solver.system.step import SERIES, Solution, estimate, only, prepared, solve_lifted
 from capsense.solver.system.system_kernels import COARSE, GAIN, factorise, leaf_charges
 
 
@@ -41,6 +42,7 @@ def solve_lossy(
     fabric = np.zeros((green.terminals, green.terminals))
     fabric_change(records, green, fabric)
     records = records.copy()
+    ties = np.where(records["layer"] > 0.0, 0.0, ties)  # of layers of dipoles
     records["inverse_susceptibility"] = np.abs(inverse_susceptibility)
     near = near_bodies(records, green, True)
     press_out(records, near, green)
@@ -48,19 +50,19 @@ def solve_lossy(
     if not near.any():
         return found._replace(delta=found.delta + fabric)
 
-    def real(value: float, outline: bool = True) -> NDArray[Any]:
-        some = records.copy()
-        some["inverse_susceptibility"][near] = value
-        some["outline"][near] *= outline
-        return np.asarray(solve_lifted(some, green, threshold, width, False).delta)
-
-    rest, off = np.zeros_like(found.delta), np.zeros_like(found.delta.real)
+    alone = only(records, near)
+    own = found.delta
     if not near.all():
-        gone = np.where(near, NOTHING, inverse_susceptibility)
-        rest = _lossy_lifted(records, ties, gone, green, threshold, width).delta
-        off = real(NOTHING)
-    delta = rest + in_series_lossy(found.delta - rest, real(0.0, False) - off, real(0.0) - off)
-    doubt = SERIES * np.abs(np.diag(delta - found.delta))[: green.electrodes].max(initial=0.0)
+        own = _lossy_lifted(
+            alone, ties[near], inverse_susceptibility[near], green, threshold, width
+        ).delta
+    alone["inverse_susceptibility"] = 0.0
+    high = np.asarray(solve_lifted(alone, green, threshold, width, False).delta)
+    alone["outline"] = 0
+    low = np.asarray(solve_lifted(alone, green, threshold, width, False).delta)
+    change = in_series_lossy(own, low, high) - own
+    delta = found.delta + change
+    doubt = SERIES * np.abs(np.diag(change))[: green.electrodes].max(initial=0.0)
     return found._replace(delta=delta + fabric, error=found.error + float(doubt), near=near)
 
 
@@ -77,6 +79,8 @@ def _lossy_lifted(
     plain["ground_elastance"], plain["inverse_susceptibility"] = 0.0, 0.0
     none = facing_of(plain[:0])
     cut, leaves, functions, system = prepared(plain, green, threshold, width, none, plain)
+    fine = fine_layers(plain, functions, system.phi, green)
+    fine = np.einsum("b,bij->ij", 1.0 / (1.0 + inverse_susceptibility), fine)
     plain["inverse_susceptibility"] = 1.0
     inside = prepared(plain, green, threshold, width, none, plain)[3]
     phi, real, below, own = system
@@ -109,10 +113,13 @@ def _lossy_lifted(
     x = np.zeros((len(fade), m), complex)
     x[:n], x[n:] = solved, extra[n:]
     delta = _product(phi[:n, :m].T, solved) + left
+    delta, left = delta + fine, left + SERIES * fine
     coarse = (
         COARSE * (functions.panel_end_fraction[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
     )
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
+    leaves, first = faces_of(leaves)
+    charge = face_charges(charge, first)
     delta, left = 0.5 * (delta + delta.T), np.ascontiguousarray(left.real)
     error = estimate(np.ascontiguousarray(delta.real), left, coarse, shift, green.electrodes)
     return Solution(

@@ -31,6 +31,13 @@ from capsense.solver.gap.gap_kernels import (
 )
 from capsense.solver.gap.series_kernels import difference, in_series
 from capsense.solver.gradients.gradient_kernels import jacobian
+from capsense.solver.interaction.layer_kernels import (
+    face_charges,
+    faces_of,
+    fine_layers,
+    joined_pairs,
+    joined_rows,
+)
 from capsense.solver.interaction.pair_kernels import bound_images, leaf_pairs
 from capsense.solver.interaction.subpanel_kernels import add_parts
 from capsense.solver.placement.placement_kernels import ActiveClusters, leaf_rows, placed
@@ -56,8 +63,6 @@ from capsense.solver.system.system_kernels import (
 
 DIFFERENCE = 3e-3
 """Step of central differences, over the validity distance."""
-NOTHING = 1e9
-"""Softness 1 / (eps - 1) of what is as good as not there."""
 SERIES = 0.1
 """Assumed relative error of what near dielectrics add."""
 FIELD_ERROR = 0.015
@@ -126,8 +131,11 @@ def prepared(
     leaves = placed(bodies, cut, green)
     hold_apart(bodies, facing, leaves, green)
     cut, leaves = truncate_to_domain(cut, leaves)
-    rows = leaf_rows(leaves.points, leaves.outside_fraction, green)
-    pairs = leaf_pairs(leaves, green.floor)
+    faces, first = faces_of(leaves)
+    rows = leaf_rows(faces.points, faces.outside_fraction, green)
+    pairs = leaf_pairs(faces, green.floor)
+    if first[-1] > leaves.points.shape[0]:
+        rows, pairs = joined_rows(rows, first), joined_pairs(pairs, first)
     add_parts(bodies, cut, leaves, pairs)
     bound_images(leaves, rows, pairs, green)
     functions = functions_of(bodies, cut, leaves.outside_fraction)
@@ -185,29 +193,22 @@ def _solve(
     press_out(bodies, soft, green)
     found = solve_lifted(bodies, green, threshold, width, adjoint)
     m, plain = green.terminals, np.bool_(False)  # the literal would compile another version
-    rest = np.zeros((m, m))
-    stiff = bodies.copy()
+    alone = only(bodies, soft)
+    own = found.delta
     if not soft.all():
-        for b in range(bodies.shape[0]):
-            if soft[b]:
-                stiff[b].inverse_susceptibility = NOTHING
-        rest = solve_lifted(stiff, green, threshold, width, plain).delta
-    for b in range(bodies.shape[0]):
-        if soft[b]:
-            stiff[b].inverse_susceptibility = 0.0
-    high = solve_lifted(stiff, green, threshold, width, plain).delta
-    for b in range(bodies.shape[0]):
-        if soft[b]:
-            stiff[b].outline = 0  # lifted, and nothing is added
-    low = solve_lifted(stiff, green, threshold, width, plain).delta
-    delta = in_series(difference(found.delta, rest), difference(low, rest), difference(high, rest))
-    doubt = 0.0
+        own = solve_lifted(alone, green, threshold, width, plain).delta
+    for b in range(alone.shape[0]):
+        alone[b].inverse_susceptibility = 0.0
+    high = solve_lifted(alone, green, threshold, width, plain).delta
+    for b in range(alone.shape[0]):
+        alone[b].outline = 0  # lifted, and nothing is added
+    low = solve_lifted(alone, green, threshold, width, plain).delta
+    change, doubt = difference(in_series(own, low, high), own), 0.0
     for i in range(m):
-        before = found.delta[i, i]
         for j in range(m):
-            found.delta[i, j] = delta[i, j] + rest[i, j]
+            found.delta[i, j] += change[i, j]
         if i < green.electrodes:
-            doubt = max(doubt, SERIES * abs(found.delta[i, i] - before))
+            doubt = max(doubt, SERIES * abs(change[i, i]))
     return Solution(
         found.delta,
         found.residual_correction,
@@ -224,6 +225,20 @@ def _solve(
         found.node,
         found.weights,
     )
+
+
+@compiled
+def only(bodies: NDArray[np.void], wanted: NDArray[np.bool_]) -> NDArray[np.void]:
+    """Some bodies, by themselves: what a lift changes of near dielectrics is local."""
+    out, first, count = bodies.copy(), np.full(bodies.shape[0], -1), 0
+    for b in range(bodies.shape[0]):
+        if wanted[b]:
+            out[count] = bodies[b]
+            if first[bodies[b].group] < 0:
+                first[bodies[b].group] = count
+            out[count].group = first[bodies[b].group]
+            count += 1
+    return out[:count]
 
 
 @compiled
@@ -244,10 +259,13 @@ def solve_lifted(
     if facing.pairs == 0:
         scored = bodies
     cut, leaves, functions, system = prepared(bodies, green, threshold, width, facing, scored)
+    fine = fine_layers(bodies, functions, system.phi, green)
     if nodes > 0:
         system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
+    leaves, first = faces_of(leaves)
+    charge = face_charges(charge, first)
     weights, doubt = np.zeros((m, m)), 0.0
     if near.any() or tied:
         thin, plain = slenderness(bodies, lifted, green.gap.validity), delta.copy()
@@ -263,6 +281,13 @@ def solve_lifted(
             plain = congruent(before, plain, capacitance)
             for i in range(green.electrodes):
                 doubt = max(doubt, thin * abs(delta[i, i] - plain[i, i]))
+    for b in range(bodies.shape[0]):
+        if bodies[b].layer > 0.0:
+            part = 1.0 / (1.0 + bodies[b].inverse_susceptibility)
+            for i in range(m):
+                for j in range(m):
+                    delta[i, j] += part * fine[b, i, j]
+                    left[i, j] += SERIES * part * fine[b, i, j]
     error = estimate(delta, left, coarse[:m], shift, green.electrodes) + doubt
     return Solution(
         delta[:m, :m],
@@ -328,12 +353,13 @@ def slopes_of(
     """How the Maxwell matrix changes with the pose of each body, as ``gradient_kernels.jacobian``.
 
     Bodies near the design are lifted, and pressed out of it. What that changes is not in the
-    adjoint, so that their slopes are central differences of the step itself, 12 more of it.
+    adjoint, so that their slopes are central differences of the step itself, 12 more of it; so are
+    those of layers of dipoles.
     """
     out, m = jacobian(solution, bodies, green), green.terminals
     moved = bodies.copy()
     for b in range(bodies.shape[0]):
-        if not solution.near[b]:
+        if not solution.near[b] and bodies[b].layer == 0.0:
             continue
         step = DIFFERENCE * green.gap.validity
         arm = max(extent_of_body(bodies[b]), green.gap.validity)

@@ -24,6 +24,7 @@ from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
     at,
+    doubles,
     madd,
     put_span,
     span,
@@ -229,7 +230,13 @@ def _add_matter(bodies, functions, matrix, own):
             for e in range(f + 1):
                 if functions.net[e] and bodies[functions.body[e]].group == body.group:
                     matrix[f, e] += body.ground_elastance
-        elif body.sheet > 0.0:
+        if body.layer > 0.0:
+            across = doubles(body.own)[functions.number[f]] / body.scale
+            across *= 1.0 + body.inverse_susceptibility
+            own[f] += across
+            if f < solved:
+                matrix[f, f] += across
+        elif not functions.net[f] and body.sheet > 0.0 and functions.number[f] >= body.n_tabulated:
             along = SHEET * body.inverse_susceptibility / body.sheet
             own[f] += along
             if f < solved:

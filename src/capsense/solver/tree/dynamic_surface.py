@@ -49,6 +49,8 @@ class PieceArrays:
     """Corners of triangles [m], shape (n, 3, 3); None for rectangles, which moments tell."""
     grid: tuple[int, int, int] = 0, 0, 0
     """Images, rows and columns of the first pieces, which are pixels."""
+    normals: Array | None = None
+    """Unit normals of triangles, shape (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,7 @@ def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, PieceArrays]:
         Clusters of all pieces, the same ones at every instant; and the pieces.
     """
     cut = layout_of(shape.rest)
-    return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)[0]
+    return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)
 
 
 def layout_of(rest: RestSurface) -> PieceLayout:
@@ -104,12 +106,13 @@ def _cut(rest: RestSurface) -> PieceLayout:
         other[row, start] = middle
         shares[long, end] = middle
         face, shares = np.concatenate([face, face[long]]), np.concatenate([shares, other])
-    first, normals = _pieces(rest.vertices, rest.faces, face, shares)
-    return PieceLayout(face, shares, split(features(first.centers, normals), first.areas))
+    first = _pieces(rest.vertices, rest.faces, face, shares)
+    assert first.normals is not None
+    return PieceLayout(face, shares, split(features(first.centers, first.normals), first.areas))
 
 
-def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[PieceArrays, Array]:
-    """Pieces, see :class:`PieceLayout`, and their normals, shape (n, 3)."""
+def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> PieceArrays:
+    """Pieces, see :class:`PieceLayout`."""
     corners = shares @ vertices[faces[face]]
     centers = corners.mean(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -117,7 +120,8 @@ def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Pi
     normals /= np.maximum(double, 1e-300)[:, None]
     areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / 2
     arms = corners - centers[:, None]
-    return PieceArrays(centers, areas, arms.transpose(0, 2, 1) @ arms / 12, corners), normals
+    moments = arms.transpose(0, 2, 1) @ arms / 12
+    return PieceArrays(centers, areas, moments, corners, normals=normals)
 
 
 def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool_], float]:
@@ -298,10 +302,13 @@ class DynamicBody:
             record[name] = getattr(self, f"_{name}").ctypes.data
         self.record = record
 
+    table: Array32 | None = None
+    """See :attr:`neumann_to_dirichlet`."""
+
     @property
     def neumann_to_dirichlet(self) -> Array32 | None:
         """What the inside has beyond ``record["inside"]`` times the energy, if that is known."""
-        return None
+        return self.table
 
     @cached_property
     def order(self) -> Ints:
@@ -326,3 +333,40 @@ class DynamicBody:
         """That of all but the impedance, which may come later."""
         held = (a for name, a in self.__dict__.items() if name != "_impedance")
         return sum(a.nbytes for a in held if isinstance(a, np.ndarray))
+
+
+class DipoleLayer(DynamicBody):
+    """The dipoles across a thin sheet of a dielectric, on the clusters of its charges.
+
+    A charge function is an even layer of charge on the front of its cluster, and the opposite one
+    on the back; see ``interaction.layer_kernels``.
+
+    Args:
+        sheet: The sheet, of triangles.
+    """
+
+    def __init__(self, sheet: DynamicBody) -> None:
+        pieces = sheet.pieces
+        assert pieces is not None
+        assert pieces.normals is not None
+        assert pieces.corners is not None
+        self.sheet, self.pieces, self._sheet = 0.0, None, sheet
+        self._panel, self._extent, self._center = sheet._panel, sheet._extent, sheet._center
+        self.capacitance = sheet.capacitance
+        children, area, split_ = sheet._children, sheet._charge, sheet._panel < 0
+        self._normals = np.empty((len(children), 3))
+        self._normals[~split_] = pieces.normals[sheet._panel[~split_]]
+        tree_kernels.means(children, area, self._normals)
+        across = 4.0 * math.pi * sheet.sheet
+        self._own = np.empty((len(children) + 1) // 2)
+        self._own[0] = across / area[0]
+        first, second = children[split_].T
+        self._own[sheet._function[split_]] = across * (1.0 / area[first] + 1.0 / area[second])
+        self.record = record = sheet.record.copy()
+        record["sheet"], record["inside"], record["layer"] = 0.0, 0.0, sheet.sheet
+        inner = pieces.centers[:, None] + 0.5 * (pieces.corners - pieces.centers[:, None])
+        self._pieces = np.concatenate(  # which are good to the second order, at Gauss points
+            [inner.reshape(-1, 9), pieces.normals, pieces.areas[:, None]], axis=1
+        )
+        for name in ("own", "normals", "pieces"):
+            record[name] = getattr(self, f"_{name}").ctypes.data

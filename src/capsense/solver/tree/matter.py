@@ -17,7 +17,7 @@ from capsense.scene.geometry_kernels import parted
 from capsense.scene.materials import Grounding, Material, ties_of
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import ShapeKind
-from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.dynamic_surface import DipoleLayer, DynamicBody
 from capsense.solver.tree.rigid import HALF_SPACE, RigidShape
 
 Array = NDArray[np.float64]
@@ -190,6 +190,10 @@ class Matter:
                 records["n_tabulated"][k] = len(block)
             if isinstance(shape, DynamicBody):
                 records["sheet"][k] = shape.sheet
+            if isinstance(shape, DipoleLayer):  # its one even function has no net charge
+                records["neutral"][k], records["ground_elastance"][k] = 0, 0.0
+                records["group"][k] = k
+                records["polarization_stiffness"][k] = np.abs(inverse_susceptibility[k])
 
 
 def matter_of(

@@ -79,6 +79,9 @@ BODY = np.dtype(
         ("local_tie", np.float64),  # its capacitance to the local ground [m]; 0 for none
         ("inside", np.float64),  # impedance of its inside, over its energy; 0 for a sheet
         ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
+        # thickness of a layer of dipoles [m], 0 for charges; mean normals of its clusters; and of
+        # each of its pieces three points, normal and area
+        ("layer", np.float64), ("normals", np.int64), ("pieces", np.int64),
         ("inverse_susceptibility", np.float64),  # 1 / (eps - 1), 0 for a conductor
         # about what its inside adds to energies, over them, as it scores
         ("polarization_stiffness", np.float64),

@@ -42,7 +42,14 @@ from capsense.solver.tree.fine_panels import (
     wide_body,
     wide_pieces,
 )
-from capsense.solver.tree.rigid import Clusters, RigidShape, charged_tree, rigid_shape
+from capsense.solver.tree.inside import table_of
+from capsense.solver.tree.rigid import (
+    HALF_SPACE,
+    Clusters,
+    RigidShape,
+    charged_tree,
+    rigid_shape,
+)
 from capsense.solver.tree.subpanels import refined
 
 Array = NDArray[np.float64]
@@ -156,8 +163,7 @@ def functions_of(
     if isinstance(shape, Layers):
         return DynamicBody(*layer_pieces(shape)), 1.0
     if isinstance(shape, SurfaceMesh):
-        sheet = 0.0 if shape.closed else shape.rest.thickness
-        return DynamicBody(*mesh_pieces(shape), sheet=sheet), 1.0
+        return _surface(shape, conducting), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest, finest)):
         return in_pieces(shape, pieces, conducting)
     if not conducting:
@@ -176,6 +182,17 @@ def functions_of(
     return _kept(
         shape, count, f"_parts {power}", lambda whole, *_: refined(found, side, whole)
     )  # fmt: skip
+
+
+def _surface(shape: SurfaceMesh, conducting: bool) -> DynamicBody:
+    """A surface that deforms; of dielectrics with what is known of their inside."""
+    sheet = 0.0 if shape.closed else shape.rest.thickness
+    out = DynamicBody(*mesh_pieces(shape), sheet=sheet)
+    if not conducting:
+        out.table = table_of(shape.rest)
+        if shape.closed:
+            out.record["inside"] = HALF_SPACE
+    return out
 
 
 def rigid(shape: Shape, count: int, *, conducting: bool = False) -> tuple[RigidShape, float]:

@@ -184,6 +184,17 @@ def moments(children, panel, charge, center, spread):
                 )
 
 
+@compiled
+def means(children, charge, values):
+    """Fill means of all clusters (t, 3) from those of clusters without parts, by their charges."""
+    for k in range(children.shape[0] - 1, -1, -1):
+        if children[k, 0] >= 0:
+            a, b = children[k, 0], children[k, 1]
+            p = charge[a] / charge[k]
+            for i in range(3):
+                values[k, i] = p * values[a, i] + (1.0 - p) * values[b, i]
+
+
 @kernel
 def _upwards(children, order):
     """Clusters such that parts come before their cluster, and no others between.

@@ -1,0 +1,55 @@
+"""The packaged materials, as the table of the docs.
+
+python benchmarks/materials.py                              # print the table
+python benchmarks/materials.py --write docs/materials.md    # replace the one of the page
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from capsense.scene.materials import DATA, MATERIALS
+
+START, END = "<!-- materials -->", "<!-- end of materials -->"
+
+
+def table() -> str:
+    """Materials and paths to ground of ``materials.toml``, in Markdown."""
+    lines = ["| material | ε<sub>r</sub> | σ (S/m) | conductor at 250 kHz | source |"]
+    lines.append("| --- | --- | --- | --- | --- |")
+    for name, m in MATERIALS.items():
+        sigma = f"{m.sigma:.3g}" if m.sigma else "–"
+        conducts = "yes" if m.is_conductor() else "no"
+        if m.is_conductor() != m.is_conductor(1e6):
+            conducts += "; at 1 MHz " + ("no" if conducts == "yes" else "yes")
+        lines.append(f"| {name} | {m.eps_r:g} | {sigma} | {conducts} | {m.source} |")
+    other = ", ".join(f"{new} = {old}" for new, old in DATA["aliases"].items())
+    lines += ["", f"Other names: {other}.", ""]
+    lines += ["| path to ground | C (pF) | in series (Ω) | source |", "| --- | --- | --- | --- |"]
+    for name, path in DATA["ground_paths"].items():
+        series = f"{path['series']:g}" if "series" in path else "–"
+        farads = f"{path['capacitance'] * 1e12:g}"
+        lines.append(f"| {name} | {farads} | {series} | {path['source']} |")
+    return "\n".join(lines)
+
+
+def replaced(page: str) -> str:
+    """A page with the table between its markers."""
+    before, _, rest = page.partition(START)
+    return f"{before}{START}\n\n{table()}\n\n{END}{rest.partition(END)[2]}"
+
+
+def main() -> None:
+    """Print the table, or write it into a page."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--write", type=Path, metavar="PAGE", help="page to put the table into")
+    page: Path | None = parser.parse_args().write
+    if page is None:
+        print(table())
+    else:
+        page.write_text(replaced(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""The page on materials has the packaged materials, as ``materials.toml`` has them."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from capsense.scene.materials import DATA, MATERIALS
+
+ROOT = Path(__file__).parents[3]
+SCRIPT = ROOT / "benchmarks" / "materials.py"
+PAGE = (ROOT / "docs" / "materials.md").read_text(encoding="utf-8")
+
+
+def test_the_page_is_up_to_date() -> None:
+    spec = importlib.util.spec_from_file_location("materials_page", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    write = "run python benchmarks/materials.py --write docs/materials.md"
+    assert module.replaced(PAGE) == PAGE, write
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_a_row_has_the_numbers_of_the_file(name: str) -> None:
+    """Read back from the text of the page, not by the script that wrote it."""
+    (row,) = re.findall(rf"^\| {re.escape(name)} \| (.*) \|$", PAGE, flags=re.MULTILINE)
+    eps_r, sigma, conducts, source = row.split(" | ")
+    given = DATA["materials"][name]
+    assert float(eps_r) == given["eps_r"]
+    assert float(sigma.replace("–", "0")) == given.get("sigma", 0.0)
+    assert conducts.startswith("yes" if MATERIALS[name].is_conductor() else "no")
+    assert source == given["source"] != ""
