@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -47,3 +49,20 @@ def test_thresholds(table: ModuleType) -> None:
     coarse = cs.Readout.preset("teensy", ("E",), noise=False)
     assert abs(table.threshold(coarse, empty)[0] / 20e-15 - 1) < 1e-6
     assert np.isinf(table.threshold(noisy, np.array([1e-9]))).all()
+
+
+def test_page(table: ModuleType, field_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page has all designs and chips, and one of its cells is computed again."""
+    monkeypatch.setenv("CAPSENSE_CACHE_DIR", str(field_cache))
+    page = (Path(__file__).parents[3] / "docs" / "choosing.md").read_text(encoding="utf-8")
+    start, end = (page.index(marker) for marker in table.MARKERS)
+    head, _, *rows = (
+        [cell.strip(" `") for cell in line.split("|")[1:-1]]
+        for line in page[start:end].splitlines()[1:]
+    )
+    assert head[1:] == list(table.CHIPS)
+    assert [r[0] for r in rows] == list(table.DESIGNS)
+    shown = dict(zip(head, next(r for r in rows if r[0] == "gripper_pad"), strict=True))["fdc1004"]
+    (found,) = table.row("gripper_pad", ["fdc1004"])
+    numbers = [[float(n) for n in re.findall(r"[\d.]+", text)] for text in (found, shown)]
+    np.testing.assert_allclose(*numbers, rtol=0.1)
