@@ -45,6 +45,19 @@ def test_hand_approach() -> None:
     assert max(s.reading.delta[0, 0] for s in samples) > 100 * first[0]
 
 
+def test_the_sample_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The files of the log are what its script makes, but for last digits of the solver."""
+    monkeypatch.syspath_prepend(str(EXAMPLES / "logs"))
+    poses, counts = importlib.import_module("make_six_patch_ball").make()
+    log = np.loadtxt(EXAMPLES / "logs/six_patch_ball.csv", delimiter=",", skiprows=2)
+    told = np.loadtxt(EXAMPLES / "logs/six_patch_ball_poses.csv", delimiter=",", skiprows=2)
+    np.testing.assert_allclose(told, poses, atol=6e-6)
+    np.testing.assert_allclose(log[:, 0], counts.time, atol=6e-5)
+    np.testing.assert_array_equal(log[:, 1], counts.channel)
+    lsb = 1.0 / 2**19  # pF
+    np.testing.assert_allclose(log[:, 2] * lsb, counts.code * lsb, atol=1e-4)
+
+
 def test_steel_bar_triangle() -> None:
     """As in the published curve: a deep dip on the line, two shallow ones on the triangle."""
     scenario = cs.load_scenario(EXAMPLES / "steel_bar_triangle.toml").resampled(5.0)

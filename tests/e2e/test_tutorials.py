@@ -13,8 +13,12 @@ from pathlib import Path
 import pytest
 from approximate import approx
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGES = [DOCS / "getting_started.md", DOCS / "own_design.md", *sorted(DOCS.glob("tutorials/*.md"))]
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [
+    *(DOCS / f"{name}.md" for name in ("getting_started", "own_design", "distance_models")),
+    *sorted(DOCS.glob("tutorials/*.md")),
+]
 REDUCED = re.compile(r"^(\w+ = ).*?#.*the tests use (.*)$", flags=re.MULTILINE)
 NUMBER = re.compile(r"-?\d+(?:\.\d*)?(?:e[-+]?\d+)?")
 
@@ -33,11 +37,12 @@ def test_a_page_runs(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Every block, in one namespace, in an empty folder; shown numbers hold to 3 % or a digit."""
+    """Every block, in one namespace, beside the examples; shown numbers hold to 3 % or a digit."""
     monkeypatch.setenv("CAPSENSE_CACHE_DIR", str(field_cache))
     monkeypatch.setenv("MPLBACKEND", "agg")
     code = blocks(page, "python")
     reduced = REDUCED.sub(r"\1\2", code)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     with chdir(tmp_path):
         for name, text in files(page).items():
             Path(name).write_text(REDUCED.sub(r"\1\2", text), encoding="utf-8")

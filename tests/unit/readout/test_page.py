@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from approximate import approx
 
+from capsense.readout.channels import ChannelBank, Pattern
 from capsense.readout.config import parse_readout
 from capsense.readout.laws import ShuntFrontEnd
 
@@ -31,12 +32,35 @@ def test_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert scope["person"] == approx(97e-12, abs=0.5e-12)
     assert abs(scope["brightest"][:2]).max() <= 0.0151  # type: ignore[index]
     assert scope["J"].shape == (21, 2240)  # type: ignore[attr-defined]
-    fit = scope["fit"]
-    truth = np.array([1.03, 2e-13, 0.0])
-    found = np.stack([fit.gain, fit.offset, fit.drift], axis=1)  # type: ignore[attr-defined]
-    # The offset is counted from the middle of the recording; there is no drift.
-    assert (np.abs(found - truth) < 4 * fit.uncertainty).all()  # type: ignore[attr-defined]
-    assert fit.uncertainty[0, 0] < 0.02  # type: ignore[attr-defined]
+
+
+def test_values_of_patterns() -> None:
+    """The table of measurements: each pattern that is shown gives the value that is shown."""
+    rng = np.random.default_rng(0)
+    c = -rng.random((6, 6))
+    c = c + c.T
+    np.fill_diagonal(c, 1.0 - c.sum(axis=1) + np.diag(c))
+    digits = {d: str(k) for k, d in enumerate("₁₂₃₄₅₆")}
+    table = PAGE.partition("| measurement | pattern | value |\n")[2].partition("\n\n")[0]
+    checked = 0
+    for row in table.splitlines()[1:]:
+        _, _, shown, value, _ = (cell.strip() for cell in row.split("|"))
+        for text in re.findall(r"`(Pattern\(.*?\))`", shown):
+            pattern = eval(text, {"Pattern": Pattern})
+            found = ChannelBank([pattern], [f"E{k}" for k in range(1, 7)]).values(c)[0]
+            if value:
+                formula = re.sub(r"Σⱼ C(.)ⱼ", lambda m: f"c[{digits[m[1]]}].sum()", value)
+                formula = (
+                    re.sub(
+                        r"C([₁-₆])([₁-₆])", lambda m: f"c[{digits[m[1]]},{digits[m[2]]}]", formula
+                    )
+                    .replace("²", "**2")
+                    .replace("−", "-")
+                )
+                formula = re.sub(r"(\d|\]) c", r"\1*c", formula)
+                assert found == approx(eval(formula, {"c": c}), rel=1e-12), text
+                checked += 1
+    assert checked == 9
 
 
 def test_files_parse() -> None:
