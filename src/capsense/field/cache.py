@@ -14,6 +14,7 @@ import io
 import json
 import logging
 import os
+import time
 import uuid
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -45,6 +46,9 @@ _log = logging.getLogger(__name__)
 
 FORMAT = 5
 """Version of the stored form; part of the cache key."""
+
+EVERY = 10.0
+"""Seconds of a build between messages that tell how far it is."""
 
 _DIGEST = hashlib.sha256().digest_size
 
@@ -257,7 +261,8 @@ def load_or_build(
         cache_dir: Where built fields are kept; default :func:`default_cache_dir`.
         shipped: Whether to look among the fields that come with the package.
         progress: Called with a stage's name and the fraction done, which never falls; not called
-            when nothing is built.
+            when nothing is built. Without one, a build that takes longer than :data:`EVERY` says so
+            as a warning of the logger, and again after as much time.
 
     Raises:
         FieldError: The field could not be built.
@@ -298,9 +303,11 @@ def load_shipped(key: str, folder: Traversable | None = None) -> BackgroundField
 def _wait_or_build(
     design: Design, settings: BuildSettings, folder: Path, key: str, progress: Progress | None
 ) -> BackgroundField:
+    if progress is None:
+        progress = _told_slowly(design.name)
+
     def waiting() -> None:
-        if progress is not None:
-            progress("waiting for another process that builds the same field", 0.0)
+        progress("waiting for another process that builds the same field", 0.0)
 
     with exclusive(folder / f"{key}.lock", waiting) as locked:
         field = _cached(folder, key, warn=True)
@@ -310,6 +317,23 @@ def _wait_or_build(
             field = build_background(design, settings, progress)
             _keep(field, folder, key)
         return field
+
+
+def _told_slowly(name: str) -> Progress:
+    """A progress callback that logs how far the field of a design is, every ten seconds."""
+    started = told = time.monotonic()
+
+    def tell(stage: str, fraction: float) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now - told >= EVERY:
+            told = now
+            _log.warning(
+                "building the field of %s, once: %s, %.0f %% done after %.0f s",
+                name, stage, 100.0 * fraction, now - started,
+            )  # fmt: skip
+
+    return tell
 
 
 def _cached(folder: Path, key: str, *, warn: bool) -> BackgroundField | None:

@@ -132,6 +132,29 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
     assert not read_arrays(path, kind="old")[0]["values"].any()
 
 
+@pytest.mark.parametrize(("every", "told"), [(0.0, True), (1e6, False)])
+def test_a_long_build_says_how_far_it_is(
+    built: BackgroundField,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    every: float,
+    told: bool,
+) -> None:
+    """Who gives no ``progress`` hears of builds that take long, and of no others."""
+
+    def build(_: object, __: object, progress: cache.Progress) -> BackgroundField:
+        progress("panels", 0.25)
+        return built
+
+    monkeypatch.setattr(cache, "build_background", build)
+    monkeypatch.setattr(cache, "EVERY", every)
+    load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path)
+    name = tiny_design().name
+    wanted = [f"building the field of {name}, once: panels, 25 % done after 0 s"] * told
+    assert [record.getMessage() for record in caplog.records] == wanted
+
+
 @pytest.mark.parametrize("mended", [False, True])
 def test_an_unusable_field_is_told_once_by_who_builds_it_again(
     built: BackgroundField,
