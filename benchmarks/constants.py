@@ -19,6 +19,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pages import write_between
+
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE.parent / "src" / "capsense"
 PACKAGES = "solver", "field"
@@ -209,11 +211,7 @@ def main() -> None:
     elif given.write is None:
         print(table())
     else:
-        page = given.write.read_text(encoding="utf-8")
-        before, _, rest = page.partition(START)
-        _, _, after = rest.partition(END)
-        text = f"{before}{START}\n{table()}\n{END}{after}"
-        given.write.write_text(text, encoding="utf-8")
+        write_between(given.write, (START, END), table())
 
 
 if __name__ == "__main__":
