@@ -158,7 +158,7 @@ def code() -> str:
 
 def measure(name: str, again: bool, extra: tuple[str, ...] = ()) -> dict[str, Any]:
     """A part's entry of the file, measured now unless ``out/headline`` has it of this code."""
-    part, kept, results = PARTS[name], OUT / f"{name}/entry.json", OUT / f"{name}/json"
+    part, kept, results = PARTS[name], OUT / f"{name}.entry.json", OUT / f"{name}.json"
     if kept.exists() and not again and not extra:
         entry: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
         if (entry["code"], entry["command"]) == (code(), part.command):
