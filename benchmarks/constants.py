@@ -94,8 +94,8 @@ def table() -> str:
     """The table of the tuned constants, in Markdown, and a count of the others."""
     known, found = notes(), constants()
     lines = [
-        "| constant, where | value | unit, or ratio to | meaning | origin | sensitivity |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| constant, where | value | unit, or ratio to | meaning | origin, sensitivity |",
+        "| --- | --- | --- | --- | --- |",
     ]
     kinds = Counter(str(known[c.key]["kind"]) for c in found)
     for c in found:
@@ -103,7 +103,8 @@ def table() -> str:
         if note["kind"] == "tuned":
             unit = "–" if note["unit"] == "1" else note["unit"]
             first = f"`{c.name}`<br>`{c.module}`", c.value, unit
-            row = *first, note["meaning"], note["origin"], note.get("sensitivity", "not measured")
+            origin = "; ".join(filter(None, (note["origin"], note.get("sensitivity"))))
+            row = *first, note["meaning"], origin
             lines.append("| " + " | ".join(row) + " |")
     others = ", ".join(f"{kinds[k]} {name}" for k, name in OTHERS.items())
     count = f"**{kinds['tuned']} constants are tuned.** Not in the table: {others}."
