@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import re
 import subprocess
 import sys
 import time
@@ -205,7 +206,7 @@ def pages() -> list[Path]:
 
 def blocks(text: str) -> dict[str, str]:
     """What a page has for each table that it names."""
-    named = [part.partition(" -->")[0] for part in text.split("<!-- figures: ")[1:]]
+    named = re.findall(r"^<!-- figures: (\S+) -->$", text, flags=re.MULTILINE)
     return {name: between(text, (f"<!-- figures: {name} -->", END)) for name in named}
 
 
