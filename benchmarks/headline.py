@@ -167,9 +167,11 @@ def measure(name: str, again: bool, extra: tuple[str, ...] = ()) -> dict[str, An
             return entry
     OUT.mkdir(parents=True, exist_ok=True)
     machine, started = describe_machine(("numpy", "numba")), time.perf_counter()
-    print(f"{name}: {part.command}", flush=True)
+    log = OUT / f"{name}.log"
+    print(f"{name}: {part.command}; prints to {log}", flush=True)
     command = [sys.executable, *part.command.split()[1:], "-o", results.as_posix(), *extra]
-    done = subprocess.run(command, cwd=ROOT, check=False, stdout=subprocess.DEVNULL)
+    with log.open("w", encoding="utf-8") as stdout:
+        done = subprocess.run(command, cwd=ROOT, check=False, stdout=stdout)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)} failed with {done.returncode}")
     found = part.figures(json.loads(results.read_text(encoding="utf-8")))
@@ -256,7 +258,8 @@ def main() -> None:
             raise SystemExit("\n".join(wrong))
         return
     if not args.write:
-        for name in args.only:
+        for place, name in enumerate(args.only):
+            print(f"part {place + 1} of {len(args.only)}", flush=True)
             figures[name] = measure(name, args.again)
             save(figures)
     for path in write_pages(figures):
