@@ -1,8 +1,8 @@
 """The headline figures of README and docs, from one run, in one file.
 
-    python benchmarks/headline.py                  # measure, write docs/figures.json and the pages
+    python benchmarks/headline.py                  # measure; write docs/figures.json, the pages
     python benchmarks/headline.py --only presets near
-    python benchmarks/headline.py --write          # the pages only, from the file
+    python benchmarks/headline.py --write          # pages and picture only, from the file
     python benchmarks/headline.py --check          # is the file of this code, are the pages of it?
 
 Each part is a benchmark that leaves its results in ``out/headline``. A run that was interrupted
@@ -32,6 +32,7 @@ from pages import between, replaced
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "out" / "headline"
+PICTURE = ROOT / "docs" / "images" / "accuracy_time.png"
 END = "<!-- end of figures -->"
 PRESETS = "fast", "standard", "fine"
 NEAR_KEYS = "rms", "p95", "worst"
@@ -232,6 +233,19 @@ def write_pages(figures: Figures) -> list[Path]:
     return changed
 
 
+def draw(figures: Figures) -> None:
+    """Draw error against time of the presets, as on the performance page."""
+    import accuracy_map
+
+    found = {name: figure["value"] for name, figure in figures["presets"]["figures"].items()}
+    results = [
+        {"label": f"surface {name}",
+         "all": {**{k: found[f"{name}/{k}"] for k in NEAR_KEYS}, "ms": found[f"{name}/step"]}}
+        for name in PRESETS
+    ]  # fmt: skip
+    accuracy_map.plot(results, PICTURE)
+
+
 def check(figures: Figures) -> list[str]:
     """What is wrong with file and pages."""
     wrong = [f"{name} is of other code" for name in PARTS if figures[name]["code"] != code()]
@@ -249,7 +263,7 @@ def main() -> None:
     )
     parser.add_argument("--only", nargs="+", choices=tuple(PARTS), default=tuple(PARTS))
     parser.add_argument("--again", action="store_true", help="measure what is there of this code")
-    parser.add_argument("--write", action="store_true", help="pages only")
+    parser.add_argument("--write", action="store_true", help="pages and picture only")
     parser.add_argument("--check", action="store_true", help="say what is out of date; exit with 1")
     args = parser.parse_args()
     figures = load() if FIGURES.exists() else {}
@@ -262,6 +276,7 @@ def main() -> None:
             print(f"part {place + 1} of {len(args.only)}", flush=True)
             figures[name] = measure(name, args.again)
             save(figures)
+    draw(figures)
     for path in write_pages(figures):
         print(f"wrote {path.relative_to(ROOT)}")
 
