@@ -152,9 +152,9 @@ def errors_of_references() -> dict[tuple[str, str], dict[str, Apart]]:
         for case in figures()[name]:
             if case != "none":
                 delta = sim.step(cs.Scene([body_of(case)])).delta
-                kind, _, rest = case.replace("diel", "eps").replace("_1.0", "").partition("_")
-                cases = out.setdefault((name, kind), {})
-                cases[rest.replace("_", " ")] = _apart(delta, delta_reference(name, case))
+                words = case.replace("_", " ").replace("diel", "eps")
+                kind, _, rest = words.removesuffix(" 1.0").partition(" ")
+                out.setdefault((name, kind), {})[rest] = _apart(delta, delta_reference(name, case))
     sim = cs.Simulator("six_patch_bare")
     for gap in (5, 10, 20, 50, 100):
         delta = sim.step(cs.Scene([capsule(gap / 1e3)])).delta
