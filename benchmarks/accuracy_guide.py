@@ -1,19 +1,21 @@
 """Error of ΔC by body, distance and preset, for the accuracy guide.
 
-    python benchmarks/accuracy_guide.py [--write docs/accuracy.md]
+    python benchmarks/accuracy_guide.py [-o out/errors.json]
 
 Scenes and errors are those of ``accuracy_map.py --scenes all``. A cell is the error of the self
 capacitances' change that 95 % of a group's electrodes stay below, in per cent.
+``headline.py`` puts the table into the page.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
 from accuracy_map import DESIGN, MAP, MORE, diagonal_errors, reference_scenes
-from sizes import write_between
+from machine import on_one_core
 
 import capsense as cs
 
@@ -34,7 +36,6 @@ GAPS = {
 }  # fmt: skip
 """Column → largest gap [m]."""
 PRESETS = ("fast", "standard", "fine")
-MARKERS = ("<!-- errors -->", "<!-- end of errors -->")
 
 
 def column(gap: float) -> str:
@@ -48,33 +49,33 @@ def row(category: str) -> str | None:
     return next(fits, None)
 
 
-def table(preset: str) -> str:
-    """The table of a preset in Markdown."""
+def errors(preset: str) -> dict[str, float]:
+    """Row, column and preset → what 95 % of the errors stay below [%]."""
     sim = cs.Simulator(DESIGN, preset=preset)
     found: dict[tuple[str, str], list[float]] = {}
     for case in (*reference_scenes(MAP), *reference_scenes(MORE)):
         name = row(case.category)
         if name is not None:
-            errors = np.abs(diagonal_errors(sim.step(case.scene).delta, case.delta))
-            found.setdefault((name, column(case.gap)), []).extend(errors)
-    lines = [f'| `"{preset}"` | ' + " | ".join(GAPS) + " |", "|---" * (1 + len(GAPS)) + "|"]
-    for name in GROUPS:
-        cells = [found.get((name, gap)) for gap in GAPS]
-        shown = ["–" if c is None else f"{100 * np.percentile(c, 95):.1f} %" for c in cells]
-        lines.append(f"| {name} | " + " | ".join(shown) + " |")
-    return "\n".join(lines)
+            off = np.abs(diagonal_errors(sim.step(case.scene).delta, case.delta))
+            found.setdefault((name, column(case.gap)), []).extend(off)
+    return {
+        f"{name}/{gap}/{preset}": float(100 * np.percentile(found[name, gap], 95))
+        for name in GROUPS for gap in GAPS if (name, gap) in found
+    }  # fmt: skip
 
 
 def main() -> None:
-    """Print the tables, or write them into a page."""
+    """Print the errors, a line each, or write them to a file."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--write", type=Path, metavar="PAGE")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json")
     options = parser.parse_args()
-    text = "\n\n".join(map(table, PRESETS))
-    if options.write is None:
-        print(text)
-        return
-    write_between(options.write, MARKERS, f"\n{text}\n")
+    on_one_core()
+    found = {key: value for preset in PRESETS for key, value in errors(preset).items()}
+    for key, value in found.items():
+        print(f"{key:50s} {value:6.2f} %")
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(json.dumps({"p95": found}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pages import write_between
+
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE.parent / "src" / "capsense"
 PACKAGES = "solver", "field"
@@ -92,8 +94,8 @@ def table() -> str:
     """The table of the tuned constants, in Markdown, and a count of the others."""
     known, found = notes(), constants()
     lines = [
-        "| constant, where | value | unit, or ratio to | meaning | origin | sensitivity |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| constant, where | value | unit, or ratio to | meaning | origin, sensitivity |",
+        "| --- | --- | --- | --- | --- |",
     ]
     kinds = Counter(str(known[c.key]["kind"]) for c in found)
     for c in found:
@@ -101,7 +103,8 @@ def table() -> str:
         if note["kind"] == "tuned":
             unit = "–" if note["unit"] == "1" else note["unit"]
             first = f"`{c.name}`<br>`{c.module}`", c.value, unit
-            row = *first, note["meaning"], note["origin"], note.get("sensitivity", "not measured")
+            origin = "; ".join(filter(None, (note["origin"], note.get("sensitivity"))))
+            row = *first, note["meaning"], origin
             lines.append("| " + " | ".join(row) + " |")
     others = ", ".join(f"{kinds[k]} {name}" for k, name in OTHERS.items())
     count = f"**{kinds['tuned']} constants are tuned.** Not in the table: {others}."
@@ -209,11 +212,7 @@ def main() -> None:
     elif given.write is None:
         print(table())
     else:
-        page = given.write.read_text(encoding="utf-8")
-        before, _, rest = page.partition(START)
-        _, _, after = rest.partition(END)
-        text = f"{before}{START}\n{table()}\n{END}{after}"
-        given.write.write_text(text, encoding="utf-8")
+        write_between(given.write, (START, END), table())
 
 
 if __name__ == "__main__":

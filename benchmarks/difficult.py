@@ -1,7 +1,7 @@
 """Errors of ΔC of difficult bodies, for the accuracy guide.
 
-    python benchmarks/difficult.py                          # all presets, a row a kind
-    python benchmarks/difficult.py --write docs/accuracy.md # the same into the page
+    python benchmarks/difficult.py                          # errors by kind and preset
+    python benchmarks/difficult.py -o out/difficult.json    # the same into a file
     python benchmarks/difficult.py --scenes                 # a line a scene
     python benchmarks/difficult.py --make --only wire       # references of scenes with this name
 
@@ -25,7 +25,6 @@ from machine import describe_machine, on_one_core
 from near_map import FEMTO, compare
 from near_reference import random_design
 from scipy.spatial.transform import Rotation
-from sizes import write_between
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
@@ -34,7 +33,6 @@ from difficult_scenes import DIFFICULT, design_of, difficult, scene_of
 import capsense as cs
 
 Row = dict[str, Any]
-MARKERS = ("<!-- difficult -->", "<!-- end of difficult -->")
 PRESETS = ("fast", "standard", "fine")
 KINDS = {
     "wire": "wires of 0.1 mm",
@@ -267,21 +265,18 @@ def results(only: str) -> dict[str, list[Row]]:
     return out
 
 
-def table(found: dict[str, list[Row]]) -> str:
-    """A row a kind, in Markdown."""
-    lines = ["| bodies | scenes | "
-             + " | ".join(f'`"{p}"` rms, worst' for p in PRESETS)
-             + " | reference's own |", "|---" * (3 + len(PRESETS)) + "|"]  # fmt: skip
+def kinds(found: dict[str, list[Row]]) -> dict[str, float]:
+    """Errors of each kind of body by preset [%], their scenes, and the reference's own error."""
+    out: dict[str, float] = {}
     for word, title in KINDS.items():
-        cells = []
         for preset in PRESETS:
             rows = [r for r in found[preset] if r["case"]["name"].startswith(word)]
             errors = 100 * np.array([e for r in rows for e in r["diagonal"]])
-            rms = math.sqrt((errors**2).mean())
-            cells.append(f"{rms:.1f}, {np.abs(errors).max():.1f} %")
-        own = max(r["case"]["error"] for r in rows)
-        lines.append(f"| {title} | {len(rows)} | " + " | ".join(cells) + f" | {100 * own:.1f} % |")
-    return "\n".join(lines)
+            out[f"{title}/{preset}/rms"] = math.sqrt((errors**2).mean())
+            out[f"{title}/{preset}/worst"] = float(np.abs(errors).max())
+        out[f"{title}/scenes"] = len(rows)
+        out[f"{title}/reference"] = 100 * max(r["case"]["error"] for r in rows)
+    return out
 
 
 def main() -> None:
@@ -293,7 +288,7 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="also those that are known")
     parser.add_argument("--only", default="", metavar="WORD", help="scenes with this in the name")
     parser.add_argument("--scenes", action="store_true", help="a line a scene")
-    parser.add_argument("--write", type=Path, metavar="PAGE")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="errors by kind")
     options = parser.parse_args()
     if options.make:
         make(options.only, options.again)
@@ -312,10 +307,12 @@ def main() -> None:
             print(f"{case['name']:32s} {case['design']:16s} {1e15 * rows[0]['largest']:9.3f} fF ± "
                   f"{100 * case['error']:.2f} % {text}")  # fmt: skip
         return
-    text = table(found)
-    print(text)
-    if options.write is not None:
-        write_between(options.write, MARKERS, f"\n{text}\n")
+    by_kind = kinds(found)
+    for key, value in by_kind.items():
+        print(f"{key:60s} {value:6.2f}")
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(json.dumps({"kinds": by_kind}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ programs disturb less.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from time import perf_counter, process_time
@@ -156,7 +157,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--device", default="cpu", help="cpu, warp:cpu or cuda:0 (default: cpu)")
     parser.add_argument("--counts", type=int, nargs="+", default=[256, 1024, 4096])
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="solves a second")
     options = parser.parse_args()
+    rates: dict[str, float] = {}
     print(describe_machine(("capsense", "numpy", "numba", "warp-lang")))
     scenes = [
         s for s in reference_scenes() if all(isinstance(b.shape, PRIMITIVES) for b in s.scene)
@@ -189,6 +192,7 @@ def main() -> int:
                 )
         for count in options.counts:
             solves, busy = rate(chosen, count, crowd=False)
+            rates[f"{value}/{count}"] = solves
             print(
                 f"{value!s:10} {count:12} {solves:10,.0f} {1e6 * busy:10,.0f}   {told}", flush=True
             )
@@ -196,6 +200,9 @@ def main() -> int:
         print(
             f"{value!s:10} {options.counts[0]:12} {solves:10,.0f} {1e6 * busy:10,.0f}   four bodies"
         )
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(json.dumps({"rates": rates}, indent=1) + "\n")
     return 0
 
 

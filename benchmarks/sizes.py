@@ -16,6 +16,8 @@ import tokenize
 from collections import defaultdict
 from pathlib import Path
 
+from pages import write_between
+
 ROOT = Path(__file__).parents[1]
 SOURCE = Path("src/capsense")
 MARKERS = ("<!-- sizes -->", "<!-- end of sizes -->")
@@ -87,13 +89,6 @@ def table(now: dict[str, tuple[int, int]], before: dict[str, tuple[int, int]] | 
     old = [f"{sum(lines for _, lines in before.values()):,}"] if before else []
     rows.append(["**all**", str(totals[0]), f"{totals[1]:,}", *old, ""])
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
-
-
-def write_between(path: Path, markers: tuple[str, str], text: str) -> None:
-    """Replace what stands between two markers of a page."""
-    page = path.read_text(encoding="utf-8")
-    start, end = (page.index(marker) for marker in markers)
-    path.write_text(f"{page[:start]}{markers[0]}\n{text}\n{page[end:]}", encoding="utf-8")
 
 
 def main() -> None:

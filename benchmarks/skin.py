@@ -8,6 +8,7 @@ found; the load says what else it did. Errors of the design are against boundary
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import sys
@@ -64,8 +65,8 @@ class World:
         )
 
 
-def time_steps(world: World, threads: int, steps: int) -> None:
-    """Print the time of a step of all sensors."""
+def time_steps(world: World, threads: int, steps: int) -> float:
+    """Print the time of a step of all sensors; its median [ms]."""
     skin = world.skin(threads)
     times, unknowns, largest = [], 0, 0.0
     busy = time.process_time()
@@ -86,6 +87,7 @@ def time_steps(world: World, threads: int, steps: int) -> None:
         f"processor time {1e3 * busy:.1f} ms; {unknowns / steps / len(SITES):.0f} unknowns a "
         f"sensor; largest change {1e15 * largest:.1f} fF"
     )
+    return float(p50)
 
 
 def parts(world: World, steps: int) -> None:
@@ -203,18 +205,27 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--only", choices=["whole-body"], help="one part alone")
+    parser.add_argument("--only", choices=["steps", "whole-body"], help="one part alone")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="median steps")
     options = parser.parse_args()
     machine = describe_machine(("numpy", "numba", "mujoco"))
     print(f"{machine['processor']}, {machine['cores']} cores, load {machine['load']:.1f}")
-    if options.only:
+    if options.only == "whole-body":
         whole_body(options.steps)
         return
-    accuracy()
+    if not options.only:
+        accuracy()
     print("a step of 16 sensors, 96 electrodes:")
     world = World()
-    for threads in range(1, (os.cpu_count() or 1) + 1):
-        time_steps(world, threads, options.steps)
+    medians = {
+        threads: time_steps(world, threads, options.steps)
+        for threads in range(1, (os.cpu_count() or 1) + 1)
+    }
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(json.dumps({"step_ms": medians}, indent=1) + "\n")
+    if options.only:
+        return
     parts(world, options.steps // 5)
     far_away(world)
     whole_body(options.steps)

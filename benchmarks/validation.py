@@ -2,8 +2,8 @@
 
 Writes ``docs/validation.md`` from ``validation_page.md``. Analytic cases and references are
 computed here, in a minute or two; the paper's and the hardware's part come from ``capsense
-reproduce all``, which is run first and only computes what it has not yet. Smoothness, boards and
-other solvers come from what their benchmarks have left in ``out/``; ``--all`` runs these.
+reproduce all``, which is run first and only computes what it has not yet. Smoothness comes from
+what its benchmark has left in ``out/``; ``--all`` runs it.
 """
 
 from __future__ import annotations
@@ -41,12 +41,8 @@ from machine import describe_machine
 from reference_scenes import MAP, MORE, ReferenceScene, reference_scenes
 from scenario1_fit import tabulate
 from validation_results import (
-    BOARDS,
-    ELEMENTS,
     SMOOTHNESS,
     Cells,
-    boards,
-    elements,
     smoothness,
     studies,
     table,
@@ -141,37 +137,54 @@ def disc_between_planes(gaps: Sequence[float] = (0.002, 0.005)) -> list[Cells]:
 # -- converged references --------------------------------------------------------------------------
 
 
-def references() -> str:
-    """Errors of ΔC on each packaged case for which there is a reference."""
-    lines = []
+Apart = tuple[float, float]
+"""Largest error of the diagonal, and of the rest as a part of the largest change."""
+
+
+def errors_of_references() -> dict[tuple[str, str], dict[str, Apart]]:
+    """Design and body → case → errors of ΔC, for each packaged case with a reference."""
+    out: dict[tuple[str, str], dict[str, Apart]] = {}
     for name in ("six_patch_bare", "six_patch"):
         sim = cs.Simulator(name)
         off = np.abs(sim.baseline / empty_reference(name) - 1)
         largest = max(np.diag(off).max(), off[0, 1], off[0, 3])
-        lines.append((name, "empty: diagonal and nearest neighbours", f"{100 * largest:.2f} %", ""))
+        out[name, "empty, nearest neighbours"] = {"–": (float(largest), math.nan)}
         for case in figures()[name]:
             if case != "none":
                 delta = sim.step(cs.Scene([body_of(case)])).delta
-                label = case.replace("_", " ").replace(" 1.0", "")
-                lines.append((name, label, *_apart(delta, delta_reference(name, case))))
+                words = case.replace("_", " ").replace("diel", "eps")
+                kind, _, rest = words.removesuffix(" 1.0").partition(" ")
+                out.setdefault((name, kind), {})[rest] = _apart(delta, delta_reference(name, case))
     sim = cs.Simulator("six_patch_bare")
     for gap in (5, 10, 20, 50, 100):
         delta = sim.step(cs.Scene([capsule(gap / 1e3)])).delta
-        case = f"tilted limb (capsule), {gap} mm"
-        lines.append(("six_patch_bare", case, *_apart(delta, capsule_reference(gap))))
+        cases = out.setdefault(("six_patch_bare", "tilted limb"), {})
+        cases[str(gap)] = _apart(delta, capsule_reference(gap))
     sim = cs.Simulator("arm_segment")
     for case in curved_figures()["cases"]:
         delta = sim.step(cs.Scene([curved_body(case)])).delta
-        lines.append(("arm_segment", case, *_apart(delta, curved_reference(case))))
-    return table(("design", "case", "diagonal of ΔC", "other entries"), lines)
+        kind, _, gap = case.partition(" ")
+        out.setdefault(("arm_segment", kind), {})[gap] = _apart(delta, curved_reference(case))
+    return out
 
 
-def _apart(delta: np.ndarray, expected: np.ndarray) -> tuple[str, str]:
+def references() -> str:
+    """The same as a table, a line a body."""
+    lines = []
+    for (design, body), cases in errors_of_references().items():
+        diagonal = ", ".join(f"{100 * errors[0]:.1f}" for errors in cases.values())
+        others = [100 * e for _, e in cases.values() if not math.isnan(e)]
+        worst = f"{max(others):.1f}" if others else "–"
+        lines.append((design, body, ", ".join(cases), diagonal, worst))
+    return table(("design", "body", "cases", "diagonal, %", "others, worst"), lines)
+
+
+def _apart(delta: np.ndarray, expected: np.ndarray) -> Apart:
     """Largest error of the diagonal; of the rest, as a part of the largest change."""
     wrong = np.abs(delta - expected)
     diagonal = (np.diag(wrong) / np.abs(np.diag(expected))).max()
     np.fill_diagonal(wrong, 0.0)
-    return f"{100 * diagonal:.2f} %", f"{100 * wrong.max() / np.abs(expected).max():.2f} %"
+    return float(diagonal), float(wrong.max() / np.abs(expected).max())
 
 
 # -- maps of scenes --------------------------------------------------------------------------------
@@ -189,7 +202,7 @@ def figures_of(rows: list[dict[str, Any]]) -> tuple[str, ...]:
     return tuple(f"{s[k]:+.2f}" if k == "mean" else f"{s[k]:.2f}" for k in keys)
 
 
-HEAD = ("scenes", "rms", "95 % below", "worst", "mean", "others: rms", "worst")
+HEAD = ("rms", "95 % below", "worst", "mean", "others: rms", "worst")
 
 
 def presets(names: Sequence[str] = PRESETS) -> str:
@@ -202,29 +215,16 @@ def presets(names: Sequence[str] = PRESETS) -> str:
     for title, cases in groups:
         for name in names:
             lines.append((title, name, len(cases), *figures_of(map_rows(name, cases))))
-    return table(("scenes", "preset", "number", *HEAD[1:]), lines)
-
-
-def categories() -> str:
-    """Errors of the standard preset, a line a category."""
-    rows = map_rows("standard", [*reference_scenes(MAP), *reference_scenes(MORE)])
-    lines = []
-    for category in sorted({r["category"] for r in rows}):
-        mine = [r for r in rows if r["category"] == category]
-        lines.append((category, len(mine), *figures_of(mine)))
-    return table(("category", *HEAD), lines)
+    return table(("scenes", "preset", "number", *HEAD), lines)
 
 
 def designs(only: str = "") -> str:
     """Errors over guarded pads and a pair of pads, of cases with ``only`` in their names."""
     lines = []
     for case in reference_designs.compared("surface", only):
-        cells = [
-            "–" if np.isnan(t) else f"{t:.2f} fF, {100 * (g / t - 1):+.2f} %"
-            for t, g in case["pairs"]
-        ]
-        lines.append((case["name"], *cells, f"{100 * case['error']:.2f} %"))
-    head = ("case", "pad (shields at ground)", "mutual", "self (shields driven)", "reference's own")
+        cells = ["–" if np.isnan(t) else f"{100 * (g / t - 1):+.2f}" for t, g in case["pairs"]]
+        lines.append((case["name"], *cells, f"{100 * case['error']:.2f}"))
+    head = ("case", "pad, shields at ground", "mutual", "self, shields driven", "reference")
     return table(head, lines)
 
 
@@ -255,7 +255,7 @@ def foretold() -> str:
         for name, found in held_out(begin, tables).items():
             correlation, error = likeness(found, tables, name)
             lines.append((name, height, f"{correlation:.4f}", f"{error:.4f}"))
-    header = ("panel that is held out", "boards' heights", "zero-mean correlation", "rms error")
+    header = ("panel held out", "boards' heights", "zero-mean correlation", "rms error")
     return table(header, lines)
 
 
@@ -264,14 +264,10 @@ def run(*command: str) -> int:
     return subprocess.run([sys.executable, *command], cwd=ROOT, check=False).returncode
 
 
-def measure_the_rest(out: Path) -> None:
-    """Fill the folder with what the page only shows."""
-    for command in (SMOOTHNESS, ELEMENTS):
-        if run(*command.split()[1:]):
-            raise SystemExit(f"{command} failed")
-    board = [sys.executable, *BOARDS.split()[1:]]
-    printed = subprocess.run(board, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    (out / "boards.txt").write_text(printed, encoding="utf-8")
+def measure_the_rest() -> None:
+    """Measure what the page only shows."""
+    if run(*SMOOTHNESS.split()[1:]):
+        raise SystemExit(f"{SMOOTHNESS} failed")
 
 
 def main() -> None:
@@ -279,24 +275,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "validation.md")
     parser.add_argument("--as-is", action="store_true", help="run no study, take what is there")
-    parser.add_argument("--all", action="store_true", help="the other benchmarks, too: an hour")
+    parser.add_argument("--all", action="store_true", help="smoothness, too: an hour")
     args = parser.parse_args()
     out = ROOT / "out"
     if args.all:
-        measure_the_rest(out)
+        measure_the_rest()
     reproduced = out / "reproduced"
     code = 0 if args.as_is else run("-m", "capsense", "reproduce", "all", "-o", str(reproduced))
     if code not in (0, 3):  # 3: a figure missed its target, which the page tells
         raise SystemExit(f"capsense reproduce all failed with {code}")
     page = TEMPLATE.read_text(encoding="utf-8").format(
         command=COMMAND, machine=machine(), analytic=analytic(), presets=presets(),
-        categories=categories(), references=references(), designs=designs(),
-        smoothness=smoothness(out / "smoothness.json"), boards=boards(out / "boards.txt"),
-        elements=elements(out / "peers_bem.json"),
-        contact=limited("contact", *PRESETS, "2,800 panels"),
+        references=references(), designs=designs(),
+        smoothness=smoothness(out / "smoothness.json"),
         wide=limited("wide", *(f"{p}: {x}" for p in PRESETS for x in ("median", "worst", "told"))),
         images=limited("images", *GAPS),
-        skin=limited("skin", *PRESETS),
         inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),
         studies=studies(reproduced), foretold=foretold(),
     )  # fmt: skip

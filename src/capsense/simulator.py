@@ -88,8 +88,8 @@ class Simulator:
         method: ``"surface"``: charges on the surfaces of the bodies. ``"fem_masked"``: the scheme
             of Schöffmann et al. 2022, where objects are staircases of tetrahedra. By default
             ``"fem_masked"`` on a mesh, else ``"surface"``.
-        preset: How finely surfaces are resolved: ``"fast"`` (some 3 % rms), ``"standard"`` or
-            ``"fine"``. ``"learning"`` is another name for ``"fast"``.
+        preset: How finely surfaces are resolved: ``"fast"``, ``"standard"`` or ``"fine"``; the
+            accuracy page has the errors. ``"learning"`` is another name for ``"fast"``.
         excitation_frequency: Excitation frequency [Hz]; decides which materials conduct.
         settings: Numerical settings of the background field; default from ``design.build``.
         cache_dir: Where built fields are kept; default the user's cache directory.

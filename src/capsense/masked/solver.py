@@ -165,9 +165,7 @@ class MaskedSolver:
     ‖b − Kφ‖ ≤ tolerance·‖b‖ in the norm of D⁻¹, where b is the load of the electrode.
     Capacitances are energies, so their error goes with the square of the tolerance: below 1e-9 of
     the largest entry at 1e-5. With "lu" the free part of K is factorised at every step, which is
-    exact but slower: for three electrodes and a moving bar, 39 against 12 ms (eps_r = 80) and 21
-    against 6 ms (grounded) at 30k tetrahedra, 329 against 34 ms and 231 against 19 ms at 95k, one
-    core.
+    exact but slower: some three times at 30,000 tetrahedra, ten times at 95,000.
     """
 
     def __init__(
