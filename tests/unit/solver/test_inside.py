@@ -95,7 +95,7 @@ def test_charge_on_both_faces(thickness: float) -> None:
         np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0.0]]) * side / np.sqrt(2.0),
         np.array([[0, 1, 2], [0, 2, 3]]),
         thickness=thickness,
-    )  # of two triangles, each as large as the square
+    )  # its first function is of two triangles, each as large as the square
     shape = surface.body().shape
     found = DynamicBody(*mesh_pieces(shape), sheet=thickness)
     x, w = np.polynomial.legendre.leggauss(200)
@@ -107,4 +107,4 @@ def test_charge_on_both_faces(thickness: float) -> None:
         return float((4 * np.outer(w, w) * (1 - u) * (1 - v) / np.sqrt(u**2 + v**2 + off**2)).sum())
 
     wanted = 2 * (mean(1e-9) - mean(thickness / side)) / (2 * side)
-    np.testing.assert_allclose(found._faces, [0.0, wanted], rtol=0.05)
+    np.testing.assert_allclose(found._faces[:2], [0.0, wanted], rtol=0.05)
