@@ -302,8 +302,9 @@ class DynamicBody:
             record[name] = getattr(self, f"_{name}").ctypes.data
         if sheet > 0.0:
             self._faces = np.zeros(n)
-            less = _on_both_faces(self._charge, sheet)
-            self._faces[self._function[~single]] = less[self._children[~single]].sum(axis=1)
+            if self.pieces is not None and self.pieces.normals is not None:  # not of an image
+                less = _on_both_faces(self._charge, sheet)
+                self._faces[self._function[~single]] = less[self._children[~single]].sum(axis=1)
             record["faces"] = self._faces.ctypes.data
         self.record = record
 
