@@ -1,7 +1,8 @@
-"""Hook of MkDocs: ``<!-- notebook: NAME -->`` in a page becomes ``examples/notebooks/NAME.ipynb``.
+"""Hooks of MkDocs: notebooks in pages, and the changelog as a page.
 
-Code, stored texts and stored figures are shown, headings one level lower, and the file is offered
-for download.
+``<!-- notebook: NAME -->`` becomes ``examples/notebooks/NAME.ipynb``: code, stored texts and stored
+figures, headings one level lower, and the file for download. Links of ``CHANGELOG.md`` are from the
+root of the repository, those of its page from ``docs``.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 FOLDER = Path(__file__).parents[1] / "examples" / "notebooks"
+CHANGELOG = Path(__file__).parents[1] / "CHANGELOG.md"
 MARKER = re.compile(r"<!-- notebook: (\w+) -->")
 
 
@@ -46,6 +48,8 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown_text: str, /, **_: Any) -> str:
-    """Put notebooks into a page."""
+def on_page_markdown(markdown_text: str, /, page: Any, **_: Any) -> str:
+    """Put notebooks, and the changelog, into a page."""
+    if page.file.src_uri == "release_notes.md":
+        return CHANGELOG.read_text(encoding="utf-8").replace("](docs/", "](")
     return MARKER.sub(lambda found: markdown(found[1]), markdown_text)

@@ -300,6 +300,12 @@ class DynamicBody:
         record["capacitance"] = self.capacitance
         for name in ("children", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
+        if sheet > 0.0:
+            self._faces = np.zeros(n)
+            if self.pieces is not None and self.pieces.normals is not None:  # not of an image
+                less = _on_both_faces(self._charge, sheet)
+                self._faces[self._function[~single]] = less[self._children[~single]].sum(axis=1)
+            record["faces"] = self._faces.ctypes.data
         self.record = record
 
     table: Array32 | None = None
@@ -333,6 +339,17 @@ class DynamicBody:
         """That of all but the impedance, which may come later."""
         held = (a for name, a in self.__dict__.items() if name != "_impedance")
         return sum(a.nbytes for a in held if isinstance(a, np.ndarray))
+
+
+def _on_both_faces(area: Array, thickness: float) -> Array:
+    """Energy of unit charge on a sheet, less that of half of it on either face [1/m].
+
+    With wave number k along the sheet, charge on both faces has (1 + exp(-k t)) / 2 of the energy
+    2π σ² / k per area that it has in the middle, π t σ² less where parts are large. Where they are
+    small, half is lost; parts count as squares, and a fraction joins both limits.
+    """
+    square = 4.0 * math.asinh(1.0) + 4.0 / 3.0 * (1.0 - math.sqrt(2.0))  # mean of 1/r in one of 1 m
+    return math.pi * thickness / (area + 2.0 * math.pi / square * thickness * np.sqrt(area))
 
 
 class DipoleLayer(DynamicBody):
