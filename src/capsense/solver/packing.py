@@ -20,9 +20,10 @@ from capsense.scene.shapes import Shape
 from capsense.solver.bodies.outline import CHANGING, write_triangles
 from capsense.solver.gap.gap_kernels import REACH
 from capsense.solver.gap.touch import Pressed
-from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.dynamic_surface import DynamicBody, MeshBody
 from capsense.solver.tree.matter import Matter
 from capsense.solver.tree.near_triangles import Face, near_triangles
+from capsense.solver.tree.refit_kernels import Refit
 from capsense.solver.tree.rigid import BODY, RigidShape
 
 Array = NDArray[np.float64]
@@ -58,11 +59,18 @@ class PackedBodies:
     """What they press onto the cover, if the design has one."""
     pressed: Sequence[Pressed] = ()
     """Those that touch the cover."""
-    near: list[Boxes] = field(default_factory=list)
-    """Triangles near the design that records point to."""
+    near: list[Boxes | Refit] = field(default_factory=list)
+    """Triangles near the design, and clusters of deforming meshes, that records point to."""
 
-    def find_near(self, green: Green) -> None:
-        """Give changing bodies near a face an outline; not sheets of dielectrics."""
+    def refit(self, green: Green, finest: float) -> None:
+        """Work out where the clusters of changing bodies are.
+
+        Those near a face get an outline, but for sheets of dielectrics. Triangles of meshes that
+        are longer than ``finest`` have parts.
+        """
+        for record, shape in zip(self.records, self.shapes, strict=True):
+            if isinstance(shape, MeshBody):
+                self.near.append(shape.enter(record, green.space, finest))
         gap = green.gap
         if not len(gap.areas):
             return

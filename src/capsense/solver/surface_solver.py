@@ -480,7 +480,7 @@ class SurfaceSolver:
             records["position"][i] += shift[i]
         out = PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
         if not laid.rigid:
-            out.find_near(self.green)
+            out.refit(self.green, math.inf if self._finest is None else self._finest)
         if self._contact is None:
             return out
         touch, pressed = self._contact.press(records, chosen, view.scene.bodies, time)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import capsense as cs
 from capsense.scene import RestSurface, SurfaceMesh
 from capsense.scene.layers import render_depth
-from capsense.solver.tree.dynamic_surface import DynamicBody, mesh_pieces
+from capsense.solver.tree.dynamic_surface import MeshBody
 from capsense.solver.tree.near_triangles import Face, near_triangles
 
 pytestmark = pytest.mark.e2e
@@ -177,7 +177,7 @@ def test_what_hangs_beside_or_behind_stays_there() -> None:
 
     def heights(z: Array) -> tuple[Array, Array]:
         moved = np.column_stack([vertices[:, :2], z])
-        body = DynamicBody(*mesh_pieces(SurfaceMesh(moved, rest)))
+        body = MeshBody(SurfaceMesh(moved, rest))
         record = body.record.copy()
         record["rotation"] = np.eye(3)
         found = near_triangles(body, record, face, 2e-3, 8e-3)

@@ -14,10 +14,22 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.errors import SolveError
+from capsense.field.face_kernels import Space
 from capsense.scene import Layers, RestSurface, SurfaceMesh
 from capsense.solver.bodies.panels import SurfacePanels
 from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.rigid import BODY, INSIDE, Clusters, features, split
+from capsense.solver.tree.mean_kernels import patch_means
+from capsense.solver.tree.refit_kernels import Refit, count_halves, pieces_of, refit
+from capsense.solver.tree.rigid import (
+    BODY,
+    INSIDE,
+    Clusters,
+    equilibrium,
+    features,
+    split,
+    spread_out,
+)
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -33,6 +45,17 @@ _HALVINGS = 60
 """Triangles are halved at most so often."""
 _LEAST_AREA = 1e-9
 """Smallest area of a piece, as a part of the mean: those that shrink to a line have none."""
+_APART = 0.05
+"""Opposite normals of a mesh count as twice so far apart at most [m], in telling faces apart: those
+of a finger and a hand are, trunks are cut across first."""
+_DEMAND = 3.0
+"""Functions of a mesh count from a score on that is this plus one times lower than usual: they are
+weighted with charges of another pose, so that more of them are needed."""
+CLUSTERS = 1000
+"""Clusters from which the charges of surfaces of many pieces are found, and the energies of larger
+ones."""
+_LEFT = 1e-5
+"""How exactly these charges are found, see :func:`equilibrium`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,25 +78,38 @@ class PieceArrays:
 class PieceLayout:
     """How the n pieces of a deforming surface lie in its triangles."""
 
-    face: Ints
-    """Triangle that a piece belongs to, shape (n,)."""
+    corner: Ints
+    """Vertices of the triangle that a piece belongs to, shape (n, 3)."""
     shares: Array
-    """Corners of the pieces as shares of the triangle's corners, shape (n, 3, 3)."""
+    """Corners of the pieces as shares of the triangle's corners, shape (n, 3, 3); empty where all
+    pieces are whole triangles."""
+    first: Array
+    """Corners of the pieces as they were first [m], shape (n, 3, 3)."""
+    longest: Array
+    """Their longest edges then [m], shape (n,)."""
+    least: float
+    """Smallest area of a piece [m²]."""
     tree: Clusters
     """Clusters of all pieces, from the form that the surface had first."""
+    density: Array
+    """Charge over area of the pieces, from that form too, shape (n,)."""
+    order: Ints
+    """The pieces, those of a cluster one after another, shape (n,)."""
+    capacitance: float
+    """About that of the surface in free space over 4π eps0 [m]."""
 
 
 _LAYOUTS: WeakKeyDictionary[RestSurface, PieceLayout] = WeakKeyDictionary()
 
 
-def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, PieceArrays]:
+def mesh_pieces(shape: SurfaceMesh) -> tuple[PieceLayout, PieceArrays]:
     """The triangles of a deforming surface, long and large ones cut into parts, a piece each.
 
     Returns:
-        Clusters of all pieces, the same ones at every instant; and the pieces.
+        How the pieces lie in the triangles, the same at every instant; and the pieces.
     """
     cut = layout_of(shape.rest)
-    return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)[0]
+    return cut, _pieces(shape.vertices, cut.corner, cut.shares, cut.least)
 
 
 def layout_of(rest: RestSurface) -> PieceLayout:
@@ -104,20 +140,76 @@ def _cut(rest: RestSurface) -> PieceLayout:
         other[row, start] = middle
         shares[long, end] = middle
         face, shares = np.concatenate([face, face[long]]), np.concatenate([shares, other])
-    first, normals = _pieces(rest.vertices, rest.faces, face, shares)
-    return PieceLayout(face, shares, split(features(first.centers, normals), first.areas))
+    if len(face) == len(corners):
+        shares = np.empty((0, 3, 3))
+    corner = np.ascontiguousarray(rest.faces[face])
+    found = _pieces(rest.vertices, corner, shares, 0.0)
+    assert found.corners is not None
+    least = max(_LEAST_AREA * float(found.areas.mean()), 1e-300)
+    areas = np.maximum(found.areas, least)
+    edges = np.roll(found.corners, -1, axis=1) - found.corners
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    tree = split(features(found.centers, normals, _APART), areas)
+    charge = clustered_equilibrium(found.centers, areas, tree)
+    size = DynamicBody(tree, PieceArrays(found.centers, areas, found.moments)).capacitance
+    # pieces stand in the order of their clusters, so that memory is read from end to end
+    single = np.flatnonzero(tree.panel >= 0)
+    at = tree.panel[single]
+    tree.panel[single] = np.arange(len(at))
+    return PieceLayout(
+        corner[at], shares[at] if len(shares) else shares, found.corners[at],
+        np.linalg.norm(edges[at], axis=2).max(axis=1), least, tree, (charge / areas)[at],
+        tree_kernels.in_order(tree.children, tree.panel), size,
+    )  # fmt: skip
 
 
-def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[PieceArrays, Array]:
-    """Pieces, see :class:`PieceLayout`, and their normals, shape (n, 3)."""
-    corners = shares @ vertices[faces[face]]
-    centers = corners.mean(axis=1)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.linalg.norm(normals, axis=1)
-    normals /= np.maximum(double, 1e-300)[:, None]
-    areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / 2
-    arms = corners - centers[:, None]
-    return PieceArrays(centers, areas, arms.transpose(0, 2, 1) @ arms / 12, corners), normals
+def _pieces(vertices: Array, corner: Ints, shares: Array, least: float) -> PieceArrays:
+    """Pieces, see :class:`PieceLayout`."""
+    n = len(corner)
+    out = np.empty((n, 3)), np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    pieces_of(np.ascontiguousarray(vertices), corner, shares, *out)
+    return PieceArrays(out[0], np.maximum(out[1], least), out[2], out[3])
+
+
+def coarsest(children: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
+    """The first clusters of a tree, as far as ``count`` of them are not split among them.
+
+    Returns:
+        Parts of these clusters, -1 where they are not split, shape (t, 2); numbers of those that
+        are not, shape (t,); and the one that each cluster of a single panel is in, shape (n,).
+    """
+    top = min(2 * count - 1, len(children))
+    first = np.where(children[:top] < top, children[:top], -1)
+    last = first[:, 0] < 0
+    parent = np.zeros(len(children), np.int64)
+    parent[children[panel < 0]] = np.flatnonzero(panel < 0)[:, None]
+    above = np.flatnonzero(panel >= 0)
+    while (below := above >= top).any():
+        above[below] = parent[above[below]]
+    return first, np.where(last, np.cumsum(last) - 1, -1), above
+
+
+def clustered_equilibrium(centers: Array, areas: Array, tree: Clusters) -> Array:
+    """About the charges that put all pieces at one potential, from clusters of them, shape (n,).
+
+    Limbs and edges carry more than their share of the surface. What is wrong here, functions of
+    smaller clusters make right.
+
+    Args:
+        centers, areas: Of the pieces [m, m²], shapes (n, 3) and (n,).
+        tree: Their clusters.
+    """
+    _, number, above = coarsest(tree.children, tree.panel, CLUSTERS)
+    cluster = np.empty(len(areas), np.int64)
+    cluster[tree.panel[tree.panel >= 0]] = number[above]
+    area: Array = np.bincount(cluster, areas).astype(float)
+    center = np.stack([np.bincount(cluster, areas * x) / area for x in centers.T])
+    try:
+        charge = equilibrium(patch_means(center, area), left=_LEFT)
+    except SolveError:  # of faces that coincide
+        return areas
+    return np.asarray((spread_out(charge, area) / area)[cluster] * areas)
 
 
 def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool_], float]:
@@ -325,3 +417,70 @@ class DynamicBody:
         """That of all but the impedance, which may come later."""
         held = (a for name, a in self.__dict__.items() if name != "_impedance")
         return sum(a.nbytes for a in held if isinstance(a, np.ndarray))
+
+
+class MeshBody(DynamicBody):
+    """A deforming mesh at one instant. Where it stands, :meth:`enter` completes its record.
+
+    Args:
+        shape: The mesh.
+    """
+
+    def __init__(self, shape: SurfaceMesh) -> None:
+        self.sheet = 0.0 if shape.closed else shape.rest.thickness
+        self._layout, self.vertices = layout_of(shape.rest), np.ascontiguousarray(shape.vertices)
+        self.capacitance = self._layout.capacitance
+        self.record = np.zeros(1, BODY)[0]
+        self.record["scale"], self.record["inside"] = 1.0, INSIDE if self.sheet == 0.0 else 0.0
+        self.record["demand"] = _DEMAND
+
+    def enter(self, record: np.void, space: Space, finest: float) -> Refit:
+        """Complete the record of the mesh where it stands; clusters near a design are divided.
+
+        Args:
+            record: Where it stands; changed.
+            space: Surroundings of the design.
+            finest: Triangles with no edge longer than this at rest stay whole [m].
+
+        Returns:
+            What the record points to.
+        """
+        cut = self._layout
+        place = record["scale"] * record["rotation"], record["position"].copy()
+        pieces = cut.corner, cut.shares, cut.first, cut.longest
+        halves = count_halves(self.vertices, pieces, place, space, finest)
+        tree = cut.tree.children, cut.tree.function, cut.tree.panel
+        made = refit(
+            self.vertices, pieces, tree, cut.density, cut.least, halves, place, space, finest, OWN
+        )
+        record["n"], record["n_panel_clusters"] = len(made.own), len(made.charge)
+        for name, values in made._asdict().items():
+            record[name] = values.__array_interface__["data"][0]  # `.ctypes` takes much longer
+        return made
+
+    def corners_within(
+        self, turn: Array, position: Array, walls: Array, low: float, high: float
+    ) -> Array | None:
+        """Corners of the pieces that reach between walls and below a height [m], (k, 3, 3).
+
+        Args:
+            turn, position: Where the mesh stands: rotation, times its size, and position.
+            walls: Along x and y, shape (2, 2).
+            low, high: Heights; None is returned where nothing reaches below the first.
+        """
+        at = self.vertices @ turn.T + position
+        if at[:, 2].min() >= low:
+            return None
+        cut = self._layout
+        where = [at[cut.corner[:, q]] for q in range(3)]
+        least, most = (f.reduce([w for w in where]) for f in (np.minimum, np.maximum))
+        near = (least[:, 2] <= high) & (least[:, :2] <= walls[1]).all(axis=1)
+        near &= (most[:, :2] >= walls[0]).all(axis=1)
+        chosen = cut.order[near[cut.order]]
+        corners = self.vertices[cut.corner[chosen]]
+        return corners if not len(cut.shares) else cut.shares[chosen] @ corners
+
+    @property
+    def nbytes(self) -> int:
+        """Room that the vertices take up [bytes]."""
+        return self.vertices.nbytes

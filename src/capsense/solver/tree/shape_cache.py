@@ -33,7 +33,7 @@ from capsense.scene import (
 from capsense.scene.shapes import ShapeKind
 from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import panels_of, polygon_panels
-from capsense.solver.tree.dynamic_surface import DynamicBody, layer_pieces, mesh_pieces
+from capsense.solver.tree.dynamic_surface import DynamicBody, MeshBody, layer_pieces
 from capsense.solver.tree.fine_panels import (
     FACES,
     FinePanelBody,
@@ -152,8 +152,7 @@ def functions_of(
     if isinstance(shape, Layers):
         return DynamicBody(*layer_pieces(shape)), 1.0
     if isinstance(shape, SurfaceMesh):
-        sheet = 0.0 if shape.closed else shape.rest.thickness
-        return DynamicBody(*mesh_pieces(shape), sheet=sheet), 1.0
+        return MeshBody(shape), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest, finest)):
         return in_pieces(shape, pieces, conducting)
     if not conducting:
