@@ -103,12 +103,18 @@ def bones(hand_only: bool) -> tuple[Bone, ...]:
             Bone(f"{side}_hip", "pelvis", (s * 0.05, 0, 0.92), (s * 0.09, 0, 0.90), 0.10),
             Bone(f"{side}_thigh", f"{side}_hip", (s * 0.09, 0, 0.90), (s * 0.10, 0, 0.50), 0.07),
             Bone(f"{side}_shank", f"{side}_thigh", (s * 0.10, 0, 0.50), (s * 0.10, 0, 0.09), 0.048),
-            Bone(f"{side}_foot", f"{side}_shank", (s * 0.10, 0.0, 0.06), (s * 0.11, 0.16, 0.04),
-                 0.038),  # fmt: skip
+            Bone(
+                f"{side}_foot",
+                f"{side}_shank",
+                (s * 0.10, 0.0, 0.06),
+                (s * 0.11, 0.16, 0.04),
+                0.038,
+            ),
             Bone(f"{side}_collar", "chest", (s * 0.04, 0, 1.38), (s * 0.17, 0, 1.40), 0.06),
             Bone(f"{side}_arm", f"{side}_collar", (s * 0.17, 0, 1.40), (s * 0.43, 0, 1.40), 0.046),
-            Bone(f"{side}_forearm", f"{side}_arm", (s * 0.43, 0, 1.40), (s * WRIST, 0, 1.40),
-                 0.036),  # fmt: skip
+            Bone(
+                f"{side}_forearm", f"{side}_arm", (s * 0.43, 0, 1.40), (s * WRIST, 0, 1.40), 0.036
+            ),
             *_hand(side, s, f"{side}_forearm"),
         ]
     return tuple(out)

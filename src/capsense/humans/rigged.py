@@ -241,9 +241,7 @@ def _local(node: dict[str, Any]) -> Array:
     return out
 
 
-def _rigged(
-    file: Path, tree: dict[str, Any], buffers: list[bytes], mesh: str | None
-) -> RiggedMesh:
+def _rigged(file: Path, tree: dict[str, Any], buffers: list[bytes], mesh: str | None) -> RiggedMesh:
     nodes = tree["nodes"]
     found = {
         n.get("name") or tree["meshes"][n["mesh"]].get("name") or f"node {k}": n
@@ -264,15 +262,16 @@ def _rigged(
         share = np.zeros((count, len(joints)))
         for k in range(len([n for n in names if n.startswith("JOINTS_")])):
             bone = _array(tree, buffers, names[f"JOINTS_{k}"]).astype(np.int64)
-            rows = np.arange(count)[:, None] + 0 * bone
-            np.add.at(share, (rows, bone), _array(tree, buffers, names[f"WEIGHTS_{k}"]))
+            at = np.arange(count)[:, None] + 0 * bone
+            np.add.at(share, (at, bone), _array(tree, buffers, names[f"WEIGHTS_{k}"]))
         weights.append(share / share.sum(axis=1, keepdims=True))
         corner = _array(tree, buffers, part["indices"]) if "indices" in part else np.arange(count)
         faces.append(corner.reshape(-1, 3).astype(np.int64) + first)
         first += count
     parent = {child: k for k, n in enumerate(nodes) for child in n.get("children", [])}
     above = {k: parent.get(k, -1) for k in joints}
-    local, order = {k: _local(nodes[k]) for k in joints}, []
+    local = {k: _local(nodes[k]) for k in joints}
+    order: list[int] = []
     for k in joints:  # what hangs between two joints, or above the first one, is part of a joint
         while above[k] >= 0 and above[k] not in local:
             local[k] = _local(nodes[above[k]]) @ local[k]
@@ -286,10 +285,8 @@ def _rigged(
         rows = _array(tree, buffers, skin["inverseBindMatrices"]).astype(float)
         inverse = rows.reshape(-1, 4, 4).transpose(0, 2, 1)
     whole = np.concatenate([np.concatenate(points).astype(float), np.concatenate(weights)], axis=1)
-    _, kept, number = np.unique(
-        np.round(whole, 7), axis=0, return_index=True, return_inverse=True
-    )
-    corners = number.reshape(-1)[np.concatenate(faces)]
+    _, kept, number = np.unique(np.round(whole, 7), axis=0, return_index=True, return_inverse=True)
+    corners: NDArray[np.int64] = number.reshape(-1)[np.concatenate(faces)]
     alike = (corners == np.roll(corners, 1, axis=1)).any(axis=1)
     return RiggedMesh(
         whole[kept, :3], corners[~alike], tuple(nodes[k].get("name", f"joint {k}") for k in order),

@@ -74,8 +74,8 @@ def test_updates_are_checked() -> None:
     np.testing.assert_array_equal(surface.vertices, hand.vertices)
 
 
-def glb(path: Path, *, split: bool = True) -> tuple[Array, Array]:
-    """A tube along x of two bones as a binary file; its last ring comes twice if ``split``."""
+def glb(path: Path) -> None:
+    """A tube along x of two bones as a binary file; its last ring comes twice."""
     turn = np.arange(6) * np.pi / 3
     x = np.repeat(np.linspace(0.0, 0.2, 5), 6)
     vertices = np.stack([x, 0.02 * np.tile(np.cos(turn), 5), 0.02 * np.tile(np.sin(turn), 5)], 1)
@@ -87,9 +87,8 @@ def glb(path: Path, *, split: bool = True) -> tuple[Array, Array]:
     share = np.clip(x / 0.2, 0.0, 1.0)
     weights = np.stack([1 - share, share, 0 * share, 0 * share], axis=1)
     corners = np.array(faces)
-    if split:
-        vertices, weights = (np.concatenate([a, a[24:]]) for a in (vertices, weights))
-        corners[-6:][corners[-6:] >= 24] += 6
+    vertices, weights = (np.concatenate([a, a[24:]]) for a in (vertices, weights))
+    corners[-6:][corners[-6:] >= 24] += 6
     joints = np.tile(np.array([1, 0, 0, 0], np.uint8), (len(vertices), 1))
     inverse = np.tile(np.eye(4), (2, 1, 1))
     inverse[0, 0, 3] = -0.1  # joint 0 of the skin is the far bone
@@ -119,12 +118,11 @@ def glb(path: Path, *, split: bool = True) -> tuple[Array, Array]:
     head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data))
     path.write_bytes(head + struct.pack("<I4s", len(text), b"JSON") + text
                      + struct.pack("<I4s", len(data), b"BIN\0") + data)  # fmt: skip
-    return vertices, share
 
 
 def test_a_gltf_file(tmp_path: Path) -> None:
     """Analytic: a tube bends about its middle; split vertices become one."""
-    vertices, share = glb(tmp_path / "tube.glb")
+    glb(tmp_path / "tube.glb")
     mesh = load_gltf(tmp_path / "tube.glb")
     assert (mesh.bones, mesh.parents) == (("near", "far"), (-1, 0))
     assert (len(mesh.vertices), len(mesh.faces)) == (30, 48)

@@ -48,7 +48,7 @@ _LEAST_AREA = 1e-9
 _APART = 0.05
 """Opposite normals of a mesh count as twice so far apart at most [m], in telling faces apart: those
 of a finger and a hand are, trunks are cut across first."""
-_DEMAND = 3.0
+_DEMAND = 2.0
 """Functions of a mesh count from a score on that is this plus one times lower than usual: they are
 weighted with charges of another pose, so that more of them are needed."""
 CLUSTERS = 1000
@@ -449,10 +449,9 @@ class MeshBody(DynamicBody):
         place = record["scale"] * record["rotation"], record["position"].copy()
         pieces = cut.corner, cut.shares, cut.first, cut.longest
         halves = count_halves(self.vertices, pieces, place, space, finest)
-        tree = cut.tree.children, cut.tree.function, cut.tree.panel
-        made = refit(
-            self.vertices, pieces, tree, cut.density, cut.least, halves, place, space, finest, OWN
-        )
+        tree = cut.tree.children, cut.tree.function, cut.tree.panel, cut.density
+        limits = cut.least, finest, OWN
+        made = refit(self.vertices, pieces, tree, halves, place, space, limits)
         record["n"], record["n_panel_clusters"] = len(made.own), len(made.charge)
         for name, values in made._asdict().items():
             record[name] = values.__array_interface__["data"][0]  # `.ctypes` takes much longer

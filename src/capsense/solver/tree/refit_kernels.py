@@ -24,6 +24,8 @@ WIDE_PIECE = 0.2
 """Triangles are halved whose longest edge, at rest, is more than so much of their distance from the
 design. Clusters of that size see a linear potential, so that what lies below does not count yet:
 readings do not jump where a triangle comes to be halved."""
+_NEAR = 2.0
+"""Those whose first vertex is so many times as far away are not looked into."""
 _MOST = 12
 """Triangles are halved at most so often."""
 
@@ -112,8 +114,14 @@ def count_halves(
     for i in range(n):
         if longest[i] <= finest:
             continue
+        for q in range(3):  # its first corner is no farther from its centre than that
+            for k in range(3):
+                room[0, 0, q, k] = vertices[corner[i, 0], k]
+        far = not _is_wide(room[0, 0], longest[i], place, space, middle, WIDE_PIECE / _NEAR)
+        if far and shares.shape[0] == 0:
+            continue
         _corners(vertices, corner, shares, i, room[0, 0])
-        if not _is_wide(room[0, 0], longest[i], place, space, middle):
+        if not _is_wide(room[0, 0], longest[i], place, space, middle, WIDE_PIECE):
             continue
         for q in range(3):
             for k in range(3):
@@ -145,15 +153,24 @@ def _longest(corners: Array) -> tuple[int, float]:
 
 
 @kernel
-def _is_divided(both, depth, place, space, finest, middle):
+def _is_divided(
+    both: Array, depth: int, place: tuple[Array, Array], space: Any, finest: float, middle: Array
+) -> bool:
     """Whether a triangle, now and at rest (2, 3, 3), is to be halved."""
     _, long = _longest(both[1])
-    return depth < _MOST and long > finest and _is_wide(both[0], long, place, space, middle)
+    return (
+        depth < _MOST
+        and long > finest
+        and _is_wide(both[0], long, place, space, middle, WIDE_PIECE)
+    )
 
 
 @kernel
-def _is_wide(corners, long, place, space, middle):
-    """Whether a triangle (3, 3) of such a longest edge is wide for its distance from the design."""
+def _is_wide(
+    corners: Array, long: float, place: tuple[Array, Array], space: Any, middle: Array, part: float
+) -> bool:
+    """Whether a triangle (3, 3) of such a longest edge is longer than a part of its distance from
+    the design."""
     turn, position = place
     for i in range(3):
         x = position[i]
@@ -164,11 +181,11 @@ def _is_wide(corners, long, place, space, middle):
     low, high = space.face[0], space.face[1]
     square = max(low[0] - x, x - high[0], 0.0) ** 2 + max(low[1] - y, y - high[1], 0.0) ** 2
     square += max(low[2] - z, z - high[2], 0.0) ** 2
-    return long * long > WIDE_PIECE * WIDE_PIECE * square
+    return long * long > part * part * square
 
 
 @kernel
-def _halve(room, at):
+def _halve(room: Array, at: int) -> None:
     """Replace triangle ``at`` of a stack by its halves, across the longest edge at rest."""
     start, _ = _longest(room[at, 1])
     end, other = (start + 1) % 3, (start + 2) % 3
@@ -182,9 +199,13 @@ def _halve(room, at):
 
 @compiled
 def refit(
-    vertices: Array, pieces: tuple[Ints, Array, Array, Array], tree: tuple[Ints, Ints, Ints],
-    density: Array, least: float, halves: Ints, place: tuple[Array, Array], space: Any, finest: float,
-    energy: float,
+    vertices: Array,
+    pieces: tuple[Ints, Array, Array, Array],
+    tree: tuple[Ints, Ints, Ints, Array],
+    halves: Ints,
+    place: tuple[Array, Array],
+    space: Any,
+    limits: tuple[float, float, float],
 ) -> Refit:  # fmt: skip
     """Clusters of a mesh at this instant; those below single pieces come last.
 
@@ -193,16 +214,16 @@ def refit(
         pieces: Of n pieces: vertices of the triangle that each lies in, (n, 3); its corners as
             shares of the triangle's, (n, 3, 3), or (0, 3, 3) where all are undivided; its corners
             [m], (n, 3, 3), and longest edge [m], (n,), as they were first.
-        tree: Parts, functions and pieces of the clusters, as in ``Clusters``.
-        density: Charge over area of the pieces, shape (n,).
-        least: Smallest area of a piece [m²].
+        tree: Parts, functions and pieces of the clusters, as in ``Clusters``; charge over area of
+            the pieces, shape (n,).
         halves: As of :func:`count_halves`.
         place: Where the mesh stands in the sensor frame: rotation, times its size, and position.
         space: Surroundings of the design.
-        finest: Triangles with no edge longer than this at rest are not halved [m].
-        energy: Energy of a function times the extent of its cluster.
+        limits: Smallest area of a piece [m²]; triangles with no edge longer than the second [m] at
+            rest are not halved; energy of a function times the extent of its cluster.
     """
-    children, function, panel = tree
+    children, function, panel, density = tree
+    least, finest, energy = limits
     corner, shares, first, _ = pieces
     own_corners = np.empty((3, 3))
     nodes, more = panel.shape[0], 0
@@ -210,7 +231,8 @@ def refit(
         more += halves[i]
     count = nodes + 2 * more
     out = Refit(
-        np.full((count, 2), -1), np.full(count, -1), np.empty(count), np.empty((count, 3)),
+        np.empty((count, 2), np.int64), np.empty(count, np.int64), np.empty(count),
+        np.empty((count, 3)),
         np.empty((count, 3, 3)), np.empty(count), np.empty((count + 1) // 2),
     )  # fmt: skip
     made, functions = nodes, (nodes + 1) // 2
@@ -223,6 +245,7 @@ def refit(
             out.children[k, 0], out.children[k, 1], out.function[k] = a, b, function[k]
             _join(out, k, a, b)
         else:
+            out.children[k, 0] = out.children[k, 1] = out.function[k] = -1
             _corners(vertices, corner, shares, i, own_corners)
             area = max(_triangle(own_corners, out.center[k], out.spread[k]), least)
             out.charge[k] = density[i] * area
@@ -244,6 +267,7 @@ def refit(
                 _halve(room, top)
                 for c in range(2):
                     out.children[whole, c] = made
+                    out.children[made, 0] = out.children[made, 1] = out.function[made] = -1
                     _triangle(room[top + c, 0], out.center[made], out.spread[made])
                     out.charge[made] = 0.5 * out.charge[whole]
                     out.extent[made] = _extent(out.spread[made])
@@ -261,7 +285,7 @@ def _extent(spread: Array) -> float:
 
 
 @kernel
-def _join(out, k, a, b):
+def _join(out: Refit, k: int, a: int, b: int) -> None:
     """Charge, centre and second moments of cluster k from its parts a and b."""
     whole = out.charge[a] + out.charge[b]
     p, q = out.charge[a] / whole, out.charge[b] / whole
@@ -272,6 +296,4 @@ def _join(out, k, a, b):
         x = out.center[a, i] - out.center[b, i]
         for j in range(3):
             y = out.center[a, j] - out.center[b, j]
-            out.spread[k, i, j] = (
-                p * out.spread[a, i, j] + q * out.spread[b, i, j] + p * q * x * y
-            )
+            out.spread[k, i, j] = p * out.spread[a, i, j] + q * out.spread[b, i, j] + p * q * x * y
