@@ -133,7 +133,8 @@ def placed(case: Case, body: Rig, more: float = 0.0) -> Array:
     still, vertices = (body.posed(t) @ turn.T for t in (case.turns, turns))
     owner = np.array([b.name for b in body.bones])[body.weights.argmax(axis=1)]
     mine = np.flatnonzero([name.startswith(case.part) for name in owner])
-    low = still[mine[still[mine, 2].argmin()]]
+    low = still[mine[still[mine, 2].argmin()]].copy()
+    low[2] = vertices[mine, 2].min()  # joints that turn leave the gap as it is
     return vertices + np.append(case.place, case.gap) - low
 
 
