@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import capsense as cs
 from capsense.scene import RestSurface, SurfaceMesh
-from capsense.scene.layers import render_depth
 from capsense.scene.geometry_kernels import Boxes
+from capsense.scene.layers import render_depth
 from capsense.solver.tree.dynamic_surface import MeshBody
 from capsense.solver.tree.near_triangles import Face, near_triangles
 
