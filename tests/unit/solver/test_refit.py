@@ -8,7 +8,7 @@ from rigged import rig
 
 from capsense.field.face_kernels import Space
 from capsense.scene import RestSurface, SurfaceMesh
-from capsense.solver.tree.dynamic_surface import MeshBody, layout_of, mesh_pieces
+from capsense.solver.tree.dynamic_surface import MeshBody, mesh_pieces
 from capsense.solver.tree.refit_kernels import WIDE_PIECE, Refit
 
 
@@ -32,7 +32,7 @@ def test_clusters_are_sums_over_their_pieces(gap: float) -> None:
     hand = rig(hand_only=True)
     shape = SurfaceMesh(vertices, RestSurface(hand.vertices, hand.faces))
     _, pieces = mesh_pieces(shape)
-    charge = layout_of(shape.rest).density * pieces.areas
+    charge = pieces.areas
     np.testing.assert_allclose(made.charge[0], charge.sum(), rtol=1e-12)
     center = charge @ pieces.centers / charge.sum()
     np.testing.assert_allclose(made.center[0], center, atol=1e-12)

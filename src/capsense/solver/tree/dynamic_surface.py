@@ -14,21 +14,17 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.errors import SolveError
 from capsense.field.face_kernels import Space
 from capsense.scene import Layers, RestSurface, SurfaceMesh
 from capsense.solver.bodies.panels import SurfacePanels
 from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.mean_kernels import patch_means
 from capsense.solver.tree.refit_kernels import Refit, count_halves, pieces_of, refit
 from capsense.solver.tree.rigid import (
     BODY,
     INSIDE,
     Clusters,
-    equilibrium,
     features,
     split,
-    spread_out,
 )
 
 Array = NDArray[np.float64]
@@ -50,12 +46,7 @@ _APART = 0.05
 of a finger and a hand are, trunks are cut across first."""
 _DEMAND = 2.0
 """Functions of a mesh count from a score on that is this plus one times lower than usual: they are
-weighted with charges of another pose, so that more of them are needed."""
-CLUSTERS = 1000
-"""Clusters from which the charges of surfaces of many pieces are found, and the energies of larger
-ones."""
-_LEFT = 1e-5
-"""How exactly these charges are found, see :func:`equilibrium`."""
+weighted with areas, so that more of them are needed than of rigid bodies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +82,6 @@ class PieceLayout:
     """Smallest area of a piece [m²]."""
     tree: Clusters
     """Clusters of all pieces, from the form that the surface had first."""
-    density: Array
-    """Charge over area of the pieces, from that form too, shape (n,)."""
     order: Ints
     """The pieces, those of a cluster one after another, shape (n,)."""
     capacitance: float
@@ -151,7 +140,6 @@ def _cut(rest: RestSurface) -> PieceLayout:
     normals = np.cross(edges[:, 0], edges[:, 1])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
     tree = split(features(found.centers, normals, _APART), areas)
-    charge = clustered_equilibrium(found.centers, areas, tree)
     size = DynamicBody(tree, PieceArrays(found.centers, areas, found.moments)).capacitance
     # pieces stand in the order of their clusters, so that memory is read from end to end
     single = np.flatnonzero(tree.panel >= 0)
@@ -159,7 +147,7 @@ def _cut(rest: RestSurface) -> PieceLayout:
     tree.panel[single] = np.arange(len(at))
     return PieceLayout(
         corner[at], shares[at] if len(shares) else shares, found.corners[at],
-        np.linalg.norm(edges[at], axis=2).max(axis=1), least, tree, (charge / areas)[at],
+        np.linalg.norm(edges[at], axis=2).max(axis=1), least, tree,
         tree_kernels.in_order(tree.children, tree.panel), size,
     )  # fmt: skip
 
@@ -170,46 +158,6 @@ def _pieces(vertices: Array, corner: Ints, shares: Array, least: float) -> Piece
     out = np.empty((n, 3)), np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3, 3))
     pieces_of(np.ascontiguousarray(vertices), corner, shares, *out)
     return PieceArrays(out[0], np.maximum(out[1], least), out[2], out[3])
-
-
-def coarsest(children: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
-    """The first clusters of a tree, as far as ``count`` of them are not split among them.
-
-    Returns:
-        Parts of these clusters, -1 where they are not split, shape (t, 2); numbers of those that
-        are not, shape (t,); and the one that each cluster of a single panel is in, shape (n,).
-    """
-    top = min(2 * count - 1, len(children))
-    first = np.where(children[:top] < top, children[:top], -1)
-    last = first[:, 0] < 0
-    parent = np.zeros(len(children), np.int64)
-    parent[children[panel < 0]] = np.flatnonzero(panel < 0)[:, None]
-    above = np.flatnonzero(panel >= 0)
-    while (below := above >= top).any():
-        above[below] = parent[above[below]]
-    return first, np.where(last, np.cumsum(last) - 1, -1), above
-
-
-def clustered_equilibrium(centers: Array, areas: Array, tree: Clusters) -> Array:
-    """About the charges that put all pieces at one potential, from clusters of them, shape (n,).
-
-    Limbs and edges carry more than their share of the surface. What is wrong here, functions of
-    smaller clusters make right.
-
-    Args:
-        centers, areas: Of the pieces [m, m²], shapes (n, 3) and (n,).
-        tree: Their clusters.
-    """
-    _, number, above = coarsest(tree.children, tree.panel, CLUSTERS)
-    cluster = np.empty(len(areas), np.int64)
-    cluster[tree.panel[tree.panel >= 0]] = number[above]
-    area: Array = np.bincount(cluster, areas).astype(float)
-    center = np.stack([np.bincount(cluster, areas * x) / area for x in centers.T])
-    try:
-        charge = equilibrium(patch_means(center, area), left=_LEFT)
-    except SolveError:  # of faces that coincide
-        return areas
-    return np.asarray((spread_out(charge, area) / area)[cluster] * areas)
 
 
 def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool_], float]:
@@ -449,7 +397,7 @@ class MeshBody(DynamicBody):
         place = record["scale"] * record["rotation"], record["position"].copy()
         pieces = cut.corner, cut.shares, cut.first, cut.longest
         halves = count_halves(self.vertices, pieces, place, space, finest)
-        tree = cut.tree.children, cut.tree.function, cut.tree.panel, cut.density
+        tree = cut.tree.children, cut.tree.function, cut.tree.panel
         limits = cut.least, finest, OWN
         made = refit(self.vertices, pieces, tree, halves, place, space, limits)
         record["n"], record["n_panel_clusters"] = len(made.own), len(made.charge)

@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
+from capsense.errors import SolveError
 from capsense.scene import TriMesh
 from capsense.scene.shapes import Box, Shape, ShapeKind
 from capsense.scene.surface import enclosed_volume
@@ -23,19 +24,16 @@ from capsense.solver.bodies.blocks import free_block, impedance
 from capsense.solver.bodies.grids import box_tiles
 from capsense.solver.bodies.panels import SurfacePanels, panels_of, polygon_panels
 from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.dynamic_surface import (
-    CLUSTERS,
-    DynamicBody,
-    clustered_equilibrium,
-    coarsest,
-)
-from capsense.solver.tree.mean_kernels import means_between, points_of_each
+from capsense.solver.tree.dynamic_surface import DynamicBody
+from capsense.solver.tree.mean_kernels import means_between, patch_means, points_of_each
 from capsense.solver.tree.rigid import (
     HALF_SPACE,
     Clusters,
+    equilibrium,
     features,
     once,
     split,
+    spread_out,
 )
 
 Array = NDArray[np.float64]
@@ -72,6 +70,10 @@ FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 of its faces: the first of those with flat sides, of which four points do not tell the faces apart
 there; the second of others, whose limbs are separated first. Those with flat sides are thicker
 than the third of their least extent."""
+_CLUSTERS = 1000
+"""Clusters from which the charges of wide bodies are found, and the energies of larger ones."""
+_LEFT = 1e-5
+"""How exactly these charges are found, see :func:`equilibrium`."""
 
 
 class _Wide(NamedTuple):
@@ -203,6 +205,39 @@ def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
     return thickness, thickness > _FLAT * low
 
 
+def _coarsest(children: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
+    """The first clusters of a tree, as far as ``count`` of them are not split among them.
+
+    Returns:
+        Parts of these clusters, -1 where they are not split, shape (t, 2); numbers of those that
+        are not, shape (t,); and the one that each cluster of a single panel is in, shape (n,).
+    """
+    top = min(2 * count - 1, len(children))
+    first = np.where(children[:top] < top, children[:top], -1)
+    last = first[:, 0] < 0
+    parent = np.zeros(len(children), np.int64)
+    parent[children[panel < 0]] = np.flatnonzero(panel < 0)[:, None]
+    above = np.flatnonzero(panel >= 0)
+    while (below := above >= top).any():
+        above[below] = parent[above[below]]
+    return first, np.where(last, np.cumsum(last) - 1, -1), above
+
+
+def _equilibrium(panels: SurfacePanels, cluster: Ints) -> Array:
+    """About the charges that put all panels at one potential, from clusters of them, (n,) -> (n,).
+
+    Limbs and edges carry more than their share of the surface. What is wrong here, functions of
+    smaller clusters make right.
+    """
+    area: Array = np.bincount(cluster, panels.areas).astype(float)
+    center = np.stack([np.bincount(cluster, panels.areas * x) / area for x in panels.centers.T])
+    try:
+        charge = equilibrium(patch_means(center, area), left=_LEFT)
+    except SolveError:  # of faces that coincide
+        return panels.areas
+    return np.asarray((spread_out(charge, area) / area)[cluster] * panels.areas)
+
+
 class FinePanelBody(DynamicBody):
     """A rigid shape on many panels, which meet each other without a block of energies.
 
@@ -232,8 +267,10 @@ class FinePanelBody(DynamicBody):
         tree = split(self._at, panels.areas)
         if parts is not None:
             tree = _ahead(tree, parts, _FINER)
-        children, number, _ = coarsest(tree.children, tree.panel, CLUSTERS)
-        self.weights = clustered_equilibrium(panels.centers, panels.areas, tree)
+        children, number, above = _coarsest(tree.children, tree.panel, _CLUSTERS)
+        cluster = np.empty(len(panels), np.int64)
+        cluster[tree.panel[tree.panel >= 0]] = number[above]
+        self.weights = _equilibrium(panels, cluster)
         super().__init__(tree, panels, charge=self.weights)
         self._points, self._softening_length = points_of_each(self._center, self._spread)
         # the body is rigid: they are needed at every step
@@ -261,7 +298,7 @@ class FinePanelBody(DynamicBody):
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
             free = free_block(panels)
             more = impedance(panels, free) - HALF_SPACE * free
-        children, number, above = coarsest(self._children, self._panel, len(panels))
+        children, number, above = _coarsest(self._children, self._panel, len(panels))
         single = np.flatnonzero(self._panel >= 0)
         on = cKDTree(features(panels.centers, panels.normals, self.most)).query(self._at)[1]
         share = self._charge[single] / self._charge[above]

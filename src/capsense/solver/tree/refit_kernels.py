@@ -201,7 +201,7 @@ def _halve(room: Array, at: int) -> None:
 def refit(
     vertices: Array,
     pieces: tuple[Ints, Array, Array, Array],
-    tree: tuple[Ints, Ints, Ints, Array],
+    tree: tuple[Ints, Ints, Ints],
     halves: Ints,
     place: tuple[Array, Array],
     space: Any,
@@ -214,15 +214,14 @@ def refit(
         pieces: Of n pieces: vertices of the triangle that each lies in, (n, 3); its corners as
             shares of the triangle's, (n, 3, 3), or (0, 3, 3) where all are undivided; its corners
             [m], (n, 3, 3), and longest edge [m], (n,), as they were first.
-        tree: Parts, functions and pieces of the clusters, as in ``Clusters``; charge over area of
-            the pieces, shape (n,).
+        tree: Parts, functions and pieces of the clusters, as in ``Clusters``.
         halves: As of :func:`count_halves`.
         place: Where the mesh stands in the sensor frame: rotation, times its size, and position.
         space: Surroundings of the design.
         limits: Smallest area of a piece [m²]; triangles with no edge longer than the second [m] at
             rest are not halved; energy of a function times the extent of its cluster.
     """
-    children, function, panel, density = tree
+    children, function, panel = tree
     least, finest, energy = limits
     corner, shares, first, _ = pieces
     own_corners = np.empty((3, 3))
@@ -248,7 +247,7 @@ def refit(
             out.children[k, 0] = out.children[k, 1] = out.function[k] = -1
             _corners(vertices, corner, shares, i, own_corners)
             area = max(_triangle(own_corners, out.center[k], out.spread[k]), least)
-            out.charge[k] = density[i] * area
+            out.charge[k] = area
         out.extent[k] = _extent(out.spread[k])
         if i < 0:
             out.own[function[k]] = energy / out.extent[k]
