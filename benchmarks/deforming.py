@@ -6,7 +6,8 @@
 A person of 10,688 vertices and a hand of 812, open at the wrist, follow their bones
 (``tests/helpers/rigged.py``), as meshes of SMPL-X and MANO do. Each is one connected mesh,
 posed and put over ``six_patch_bare`` and two other designs, 5 mm to 0.2 m away, grounded or on
-100 pF. No pose was used to choose a constant.
+100 pF. No constant was fitted to these poses; that charge functions are weighted with areas was
+decided on them.
 
 References are boundary elements of the posed triangles (``bem_reference.py``), those near the
 sensor divided, on two meshes; what the extrapolation adds is the stated error.
