@@ -59,7 +59,8 @@ def test_twice_the_sheet_does_twice_as_much(simulators):
 def test_losses_of_what_deforms(simulators, eps_r, sigma):
     """Differential: a ball and a sheet of 2 mm, as surfaces that deform, against rigid shapes.
 
-    In phase they are 5 and 14 % apart, in quadrature 9 and 20 %.
+    With a permittivity of 10 they are 0.3 and 4 % apart in phase, in quadrature 8 and 25 %. What is
+    left is the sheet's own: with three times the functions it is 29 to 34 % in quadrature.
     """
     sim, matter = simulators("six_patch"), cs.Material("wet", eps_r, sigma)
     ball = cs.Sphere(0.03).to_trimesh()
