@@ -60,7 +60,7 @@ def test_losses_of_what_deforms(simulators, eps_r, sigma):
     """Differential: a ball and a sheet of 2 mm, as surfaces that deform, against rigid shapes.
 
     With a permittivity of 10 they are 0.3 and 4 % apart in phase, in quadrature 8 and 25 %. What is
-    left is the sheet's own: with three times the functions it is 0.5 % in phase, 28 to 31 % in quadrature.
+    left is the sheet's own: with the preset "fine" it is 0.5 % in phase, 28 to 31 % in quadrature.
     """
     sim, matter = simulators("six_patch"), cs.Material("wet", eps_r, sigma)
     ball = cs.Sphere(0.03).to_trimesh()
