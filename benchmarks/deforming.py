@@ -2,12 +2,13 @@
 
     python benchmarks/deforming.py --reference   # computes tests/data/reference_deforming.json
     python benchmarks/deforming.py --poses fist  # only these
+    python benchmarks/deforming.py --random 6    # poses at random, with their references
 
 A person of 10,688 vertices and a hand of 812, open at the wrist, follow their bones
 (``tests/helpers/rigged.py``), as meshes of SMPL-X and MANO do. Each is one connected mesh,
 posed and put over ``six_patch_bare`` and two other designs, 5 mm to 0.2 m away, grounded or on
-100 pF. No constant was fitted to these poses; that charge functions are weighted with areas was
-decided on them.
+100 pF. That charge functions are weighted with areas, and how far opposite normals count apart, was
+decided on them; those at random were drawn afterwards.
 
 References are boundary elements of the posed triangles (``bem_reference.py``), those near the
 sensor divided, on two meshes; what the extrapolation adds is the stated error.
@@ -111,6 +112,21 @@ CASES: dict[str, Case] = {
 }  # fmt: skip
 
 
+def random_cases(count: int, seed: int = 0) -> dict[str, Case]:
+    """Hands and persons whose joints are all turned at random, in any position over a sensor."""
+    rng, out = np.random.default_rng(seed), {}
+    for k in range(count):
+        mesh = ("hand", "person")[k % 2]
+        turns = {b.name: tuple(rng.normal(0.0, 20.0, 3)) for b in rig(mesh == "hand").bones}
+        angles = tuple(rng.uniform(-180.0, 180.0, 3))
+        gap = float(np.exp(rng.uniform(np.log(0.005), np.log(0.08))))
+        out[f"random {k}"] = Case(
+            ("six_patch_bare", "pad_60", "two_pads")[k % 3], mesh, turns, "", angles,
+            tuple(rng.uniform(-0.03, 0.03, 2)), gap, ("grounded", 1e-10)[k // 2 % 2],
+        )  # fmt: skip
+    return out
+
+
 def design_of(name: str) -> cs.Design:
     """A packaged design, or one of free pads in the same box."""
     if name == "six_patch_bare":
@@ -198,6 +214,7 @@ def main() -> None:
     parser.add_argument("--reference", action="store_true", help="compute what is missing")
     parser.add_argument("--poses", nargs="+", default=list(CASES), choices=list(CASES))
     parser.add_argument("--preset", default="standard")
+    parser.add_argument("--random", type=int, default=0, help="so many poses at random instead")
     args = parser.parse_args()
     known: dict[str, Any] = json.loads(DATA.read_text()) if DATA.exists() else {}
     if args.reference:
@@ -213,17 +230,22 @@ def main() -> None:
                   np.round(1e15 * np.diag(delta), 3), flush=True)  # fmt: skip
             DATA.write_text(json.dumps({n: known[n] for n in CASES if n in known}, indent=1) + "\n")
         return
+    cases = random_cases(args.random) if args.random else {n: CASES[n] for n in args.poses}
+    if args.random:
+        held: dict[tuple[str, float], Sensor] = {}
+        for name, case in cases.items():
+            delta, error, _ = reference(case, held)
+            known[name] = {"delta_fF": (1e15 * delta).tolist(), "error": error}
     on_one_core()
     print(f"preset {args.preset}")
     print(f"{'pose':18s} {'design':18s} gap   own     all  reference  set-up      step     jump"
           "   largest  functions")  # fmt: skip
-    for name in args.poses:
-        print(row(name, known[name], args.preset), flush=True)
+    for name, case in cases.items():
+        print(row(name, case, known[name], args.preset), flush=True)
 
 
-def row(name: str, known: dict[str, Any], preset: Any) -> str:
+def row(name: str, case: Case, known: dict[str, Any], preset: Any) -> str:
     """A line of the table."""
-    case = CASES[name]
     body, sim = rig(case.mesh == "hand"), cs.Simulator(design_of(case.design), preset=preset)
     sim.step(cs.Scene([cs.Body(cs.Sphere(0.01), cs.Pose((0, 0, 0.05)))]))  # what is compiled
     start = time.process_time()

@@ -19,7 +19,13 @@ from capsense.field.face_kernels import Space
 from capsense.scene import Layers, RestSurface, SurfaceMesh
 from capsense.solver.bodies.panels import SurfacePanels
 from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.refit_kernels import Refit, count_halves, pieces_of, refit
+from capsense.solver.tree.refit_kernels import (
+    Refit,
+    count_halves,
+    pieces_of,
+    pieces_within,
+    refit,
+)
 from capsense.solver.tree.rigid import (
     BODY,
     HALF_SPACE,
@@ -43,9 +49,10 @@ _HALVINGS = 60
 """Triangles are halved at most so often."""
 _LEAST_AREA = 1e-9
 """Smallest area of a piece, as a part of the mean: those that shrink to a line have none."""
-_APART = 0.05
+_APART = 0.02
 """Opposite normals of a mesh count as twice so far apart at most [m], in telling faces apart: those
-of a finger and a hand are, trunks are cut across first."""
+of a finger are, hands and trunks are cut across first. A cluster of one face of several fingers is
+not met well as a rectangle."""
 _DEMAND = 2.0
 """Functions of a mesh count from a score on that is this plus one times lower than usual: they are
 weighted with areas, so that more of them are needed than of rigid bodies."""
@@ -438,11 +445,7 @@ class MeshBody(DynamicBody):
         if at[:, 2].min() >= low:
             return None
         cut = self._layout
-        where = [at[cut.corner[:, q]] for q in range(3)]
-        least, most = (f.reduce([w for w in where]) for f in (np.minimum, np.maximum))
-        near = (least[:, 2] <= high) & (least[:, :2] <= walls[1]).all(axis=1)
-        near &= (most[:, :2] >= walls[0]).all(axis=1)
-        chosen = cut.order[near[cut.order]]
+        chosen = pieces_within(at, cut.corner, cut.order, walls, high)
         corners = self.vertices[cut.corner[chosen]]
         return corners if not len(cut.shares) else cut.shares[chosen] @ corners
 

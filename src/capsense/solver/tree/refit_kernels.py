@@ -81,17 +81,41 @@ def pieces_of(
         areas[i] = _triangle(corners[i], centers[i], moments[i])
 
 
+@compiled
+def pieces_within(at: Array, corner: Ints, order: Ints, walls: Array, high: float) -> Ints:
+    """The pieces whose triangles reach between walls and below a height [m], in their order.
+
+    Args:
+        at: Where the vertices stand [m], shape (v, 3).
+        corner: Vertices of the triangle that each piece lies in, shape (n, 3).
+        order: The pieces, shape (n,).
+        walls: Along x and y [m], shape (2, 2).
+        high: The height [m].
+    """
+    out, count = np.empty(order.shape[0], np.int64), 0
+    for i in order:
+        a, b, c = at[corner[i, 0]], at[corner[i, 1]], at[corner[i, 2]]
+        near = min(a[2], b[2], c[2]) <= high
+        for k in range(2):
+            near = near and min(a[k], b[k], c[k]) <= walls[1, k]
+            near = near and max(a[k], b[k], c[k]) >= walls[0, k]
+        if near:
+            out[count] = i
+            count += 1
+    return out[:count]
+
+
 @kernel
 def _triangle(corners: Array, center: Array, moments: Array) -> float:
     """Area of a triangle (3, 3); its centre (3,) and second moments (3, 3) are filled in."""
     for k in range(3):
         center[k] = (corners[0, k] + corners[1, k] + corners[2, k]) / 3.0
     for i in range(3):
-        for k in range(3):
+        for k in range(i + 1):
             total = 0.0
             for q in range(3):
                 total += (corners[q, i] - center[i]) * (corners[q, k] - center[k])
-            moments[i, k] = total / 12.0
+            moments[i, k] = moments[k, i] = total / 12.0
     square = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -293,6 +317,7 @@ def _join(out: Refit, k: int, a: int, b: int) -> None:
         out.center[k, i] = p * out.center[a, i] + q * out.center[b, i]
     for i in range(3):
         x = out.center[a, i] - out.center[b, i]
-        for j in range(3):
+        for j in range(i + 1):
             y = out.center[a, j] - out.center[b, j]
-            out.spread[k, i, j] = p * out.spread[a, i, j] + q * out.spread[b, i, j] + p * q * x * y
+            both = p * out.spread[a, i, j] + q * out.spread[b, i, j] + p * q * x * y
+            out.spread[k, i, j] = out.spread[k, j, i] = both
