@@ -2,6 +2,7 @@
 
     python benchmarks/flexible.py                 # errors of the scenes, and times of steps
     python benchmarks/flexible.py --only cloth
+    python benchmarks/flexible.py --only soft --formed   # the form of use is given first
     python benchmarks/flexible.py --make          # references of scenes that have none
 
 References are written apart from the package, with all of the sensor's boundary elements
@@ -83,8 +84,11 @@ def material_of(row: Row) -> cs.Material | str:
     return "steel"
 
 
-def surface_of(row: Row) -> cs.DeformableSurface:
-    """The scene's surface, as a simulator gives it: in its first form, then bent."""
+def surface_of(row: Row, *, formed: bool = False) -> cs.DeformableSurface:
+    """The scene's surface, as a simulator gives it: in its first form, then bent.
+
+    With ``formed``, its first form is that of the scene.
+    """
     options: Row = {
         "material": material_of(row),
         "grounding": "grounded" if row["kind"] == "grounded" else "floating",
@@ -97,12 +101,16 @@ def surface_of(row: Row) -> cs.DeformableSurface:
 
         line = cable_points(row, 40)
         straight = np.linspace([-0.5, 0, 0], [0.5, 0, 0], 41) * row["length"] + [0, 0, 0.2]
-        out = cs.DeformableSurface(tube(straight, row["radius"]), tube_faces(len(line)), **options)
+        faces = tube_faces(len(line))
+        out = cs.DeformableSurface(tube(straight, row["radius"]), faces, **options)
         vertices = tube(line, row["radius"])
     else:
         v, faces = ball(8) if row["shape"] == "ball" else block(8)
         out = cs.DeformableSurface(v * row["size"] + [0, 0, 0.2], faces, **options)
         vertices = soft_map(row)(v)
+    if formed:
+        given = {"thickness": row["thickness"]} if row["what"] == "cloth" else {}
+        return cs.DeformableSurface(vertices, faces, **given, **options)
     out.vertices = vertices
     return out
 
@@ -328,7 +336,7 @@ def errors(found: Array, row: Row) -> tuple[float, float]:
 
 
 def measure(
-    only: str = "", preset: str = "standard"
+    only: str = "", preset: str = "standard", *, formed: bool = False
 ) -> Iterator[tuple[Row, float, float, float, int]]:
     """Scenes, their errors, processor time of a step [s] and unknowns."""
     sims: dict[str, cs.Simulator] = {}
@@ -338,7 +346,7 @@ def measure(
         name = row["design"]
         if name not in sims:
             sims[name] = cs.Simulator(design_of(name), preset=preset)
-        sim, surface, times = sims[name], surface_of(row), []
+        sim, surface, times = sims[name], surface_of(row, formed=formed), []
         vertices = surface.vertices
         for _ in range(5):
             surface.vertices = vertices + 0.0
@@ -354,12 +362,15 @@ def main() -> None:
     parser.add_argument("--make", action="store_true")
     parser.add_argument("--only", default="", help="part of a name")
     parser.add_argument("--preset", default="standard")
+    parser.add_argument("--formed", action="store_true", help="give the form of use first")
     given = parser.parse_args()
     if given.make:
         make(given.only)
         return
     print(f"error of channels above {COUNTS:.0%} of the largest, of entries over it; a step")
-    for row, error, other, seconds, unknowns in measure(given.only, given.preset):
+    for row, error, other, seconds, unknowns in measure(
+        given.only, given.preset, formed=given.formed
+    ):
         print(f"{row['name']:44s} {1e3 * row['gap']:5.1f} mm {100 * error:6.1f} %"
               f" {100 * other:6.1f} %"
               f"   {1e3 * seconds:5.2f} ms  {unknowns:4d}   (reference {row['error']:.1%})",

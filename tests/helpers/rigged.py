@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from capsense.field.face_kernels import Space
+
 Array = NDArray[np.float64]
 BLEND = 0.012
 """Length over which capsules run into each other [m]."""
@@ -240,3 +242,11 @@ def rig(hand_only: bool = False, pitch: tuple[float, float] | None = None) -> Ri
     weights = np.exp(-(near - near.min(axis=1, keepdims=True)) / soft)
     weights[weights < 0.02] = 0.0
     return Rig(vertices, faces, weights / weights.sum(axis=1, keepdims=True), some)
+
+
+def over_square() -> Space:
+    """Surroundings of a square design of 0.1 m that faces up, its walls far away."""
+    face = np.array([[-0.05, -0.05, -1e-3], [0.05, 0.05, 0.0]])
+    wide = np.array([[-1.0] * 3, [1.0] * 3])
+    both = np.stack([wide, wide])
+    return Space(True, face, 0.0, wide, 1.0, both, np.abs(both), 1e-3, 0.0)

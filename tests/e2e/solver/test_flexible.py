@@ -17,15 +17,15 @@ import flexible  # noqa: E402
 
 ROWS = json.loads((ROOT / "tests" / "data" / "flexible.json").read_text(encoding="utf-8"))
 KNOWN = {
-    "5 cloth, wet cloth, dielectric, six_patch": 0.17,
-    "8 cloth, wet cloth, dielectric, patch": 0.16,
+    "5 cloth, wet cloth, dielectric, six_patch": 0.1,
     "12 cable, copper, grounded, six_patch": 0.16,
     "15 cable, polyester, dielectric, six_patch": 0.15,
     "16 soft, foam, dielectric, six_patch": 0.18,
-    "18 soft, rubber, dielectric, patch": 0.16,
+    "18 soft, rubber, dielectric, patch": 0.18,
     "14 cable, copper, grounded, patch": 0.11,
 }
-"""What is worse, see docs/depth.md."""
+"""What is worse, see docs/depth.md. Cables and blocks have the clusters and the interior of their
+first form; the reference of 18 is known to 12 %."""
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row["name"])

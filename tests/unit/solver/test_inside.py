@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from rigged import over_square
 
 import capsense as cs
 from capsense.scene import RestSurface
-from capsense.solver.tree.dynamic_surface import layout_of
+from capsense.solver.tree.dynamic_surface import MeshBody, layout_of
 from capsense.solver.tree.inside import table_of
 
 LENGTH, WIDTH, THICKNESS = 0.2, 0.1, 1e-3
@@ -84,3 +86,28 @@ def test_of_a_solid_it_goes_with_its_form() -> None:
     assert table is not None
     assert table[0].max() == 0.0
     assert table[1, 1] > 0.0
+
+
+@pytest.mark.parametrize("thickness", [1e-4, 1e-3, 1e-2, 0.1])
+def test_charge_on_both_faces(thickness: float) -> None:
+    """Quadrature: half the charge on either of two squares takes less than all of it on one."""
+    side = 0.01
+    surface = cs.DeformableSurface(
+        np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0.0]]) * side / np.sqrt(2.0),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        thickness=thickness,
+    )  # its first function is of two triangles, each as large as the square
+    body = MeshBody(surface.body().shape, False)
+    record = body.record.copy()
+    record["rotation"] = np.eye(3)
+    found = body.enter(record, over_square(), 1.0)
+    x, w = np.polynomial.legendre.leggauss(200)
+    x, w = (0.5 * (x + 1)) ** 3, 1.5 * w * (0.5 * (x + 1)) ** 2
+    u, v = np.meshgrid(x, x)
+
+    def mean(off: float) -> float:
+        """Mean of 1/r between two squares of side 1."""
+        return float((4 * np.outer(w, w) * (1 - u) * (1 - v) / np.sqrt(u**2 + v**2 + off**2)).sum())
+
+    wanted = 2 * (mean(1e-9) - mean(thickness / side)) / (2 * side)
+    np.testing.assert_allclose(found.faces[:2], [0.0, wanted], rtol=0.05)

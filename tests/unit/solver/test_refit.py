@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rigged import rig
+from rigged import over_square, rig
 
-from capsense.field.face_kernels import Space
 from capsense.scene import RestSurface, SurfaceMesh
 from capsense.solver.tree.dynamic_surface import MeshBody, mesh_pieces
 from capsense.solver.tree.refit_kernels import WIDE_PIECE, Refit
@@ -18,13 +17,9 @@ def entered(gap: float, finest: float = 0.002) -> tuple[MeshBody, Refit, np.ndar
     vertices = hand.posed({"right_index_0": (0.0, -40.0, 0.0)})
     vertices = vertices - vertices[vertices[:, 2].argmin()] + [0.0, 0.0, gap]
     body = MeshBody(SurfaceMesh(vertices, RestSurface(hand.vertices, hand.faces)), True)
-    face = np.array([[-0.05, -0.05, -1e-3], [0.05, 0.05, 0.0]])
-    wide = np.array([[-1.0] * 3, [1.0] * 3])
-    both = np.stack([wide, wide])
-    space = Space(True, face, 0.0, wide, 1.0, both, np.abs(both), 1e-3, 0.0)
     record = body.record.copy()
     record["rotation"] = np.eye(3)
-    return body, body.enter(record, space, finest), vertices
+    return body, body.enter(record, over_square(), finest), vertices
 
 
 @pytest.mark.parametrize("gap", [0.005, 0.5])

@@ -216,15 +216,27 @@ def test_energies_that_cannot_be_raised_are_refused() -> None:
     assert factorise(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty((0, 0))) == 0.0
 
 
-def test_energy_of_charge_along_a_sheet() -> None:
-    """Analytic: 6 / ((eps - 1) t) besides, of each function by itself; none of the net charge."""
+@pytest.mark.parametrize("known", [0, 5])
+def test_energy_of_charge_along_a_sheet(known: int) -> None:
+    """Analytic: 6 / ((eps - 1) t) besides, of each function by itself; none of the net charge.
+
+    Nor of the functions whose impedance is in a table, the first ``known`` ones. All have less as
+    their charge is on both faces.
+    """
     plain = Scene([body(BOX, (0.01, 0.0, 0.05), TILTED, eps_r=5.0, ground_elastance=20.0)]).packed()
+    table = np.zeros((known, known), np.float32)
+    plain["n_tabulated"], plain["neumann_to_dirichlet"] = known, table.ctypes.data
+    plain["potential_coefficients"] = 0  # this table has as many rows
+    less = np.arange(float(plain["n"][0]))
     thin = plain.copy()
-    thin["sheet"] = 2e-3
+    thin["sheet"], thin["faces"] = 2e-3, less.ctypes.data
     before, after = (prepared_alone(b, 0.05)[2:] for b in (plain, thin))
     functions, solved = before[0], before[0].solved
-    assert 1 < solved < len(functions.cluster)
-    wanted = np.where(functions.net, 0.0, 6.0 / (4.0 * 2e-3))
+    assert known < solved < len(functions.cluster)
+    along = np.where(functions.number < known, 0.0, 6.0 / (4.0 * 2e-3))
+    less = less[functions.number] / plain["scale"][0]
+    wanted = np.where(functions.net, 0.0, along - less)
+    assert np.count_nonzero(wanted[:solved]) == solved - 1
     np.testing.assert_allclose(after[1].diagonal - before[1].diagonal, wanted, atol=1e-9)
     more = after[1].matrix - before[1].matrix
     np.testing.assert_allclose(more, np.diag(wanted[:solved]), atol=1e-9)

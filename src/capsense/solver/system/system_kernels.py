@@ -236,11 +236,13 @@ def _add_matter(bodies, functions, matrix, own):
             own[f] += across
             if f < solved:
                 matrix[f, f] += across
-        elif not functions.net[f] and body.sheet > 0.0 and functions.number[f] >= body.n_tabulated:
-            along = SHEET * body.inverse_susceptibility / body.sheet
-            own[f] += along
+        elif not functions.net[f] and body.sheet > 0.0:
+            more = -doubles(body.faces)[functions.number[f]] / body.scale
+            if functions.number[f] >= body.n_tabulated:
+                more += SHEET * body.inverse_susceptibility / body.sheet
+            own[f] += more
             if f < solved:
-                matrix[f, f] += along
+                matrix[f, f] += more
 
 
 @compiled

@@ -351,6 +351,9 @@ class DynamicBody:
         record["capacitance"] = self.capacitance
         for name in ("children", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
+        if sheet > 0.0:
+            self._faces = np.zeros(n)  # of an image
+            record["faces"] = self._faces.ctypes.data
         self.record = record
 
     table: Array32 | None = None
@@ -386,6 +389,17 @@ class DynamicBody:
         return sum(a.nbytes for a in held if isinstance(a, np.ndarray))
 
 
+def _on_both_faces(area: Array, thickness: float) -> Array:
+    """Energy of unit charge on a sheet, less that of half of it on either face [1/m].
+
+    With wave number k along the sheet, charge on both faces has (1 + exp(-k t)) / 2 of the energy
+    2π σ² / k per area that it has in the middle, π t σ² less where parts are large. Where they are
+    small, half is lost; parts count as squares, and a fraction joins both limits.
+    """
+    square = 4.0 * math.asinh(1.0) + 4.0 / 3.0 * (1.0 - math.sqrt(2.0))  # mean of 1/r in one of 1 m
+    return math.pi * thickness / (area + 2.0 * math.pi / square * thickness * np.sqrt(area))
+
+
 class MeshBody(DynamicBody):
     """A deforming mesh at one instant. Where it stands, :meth:`enter` completes its record.
 
@@ -417,7 +431,11 @@ class MeshBody(DynamicBody):
         """
         made = self._refit(record, space, finest if self._divided else math.inf)
         _point(record, made)
-        return made
+        if self._divided or self.sheet == 0.0:
+            return made
+        out = SheetArrays(_faces(made, self.sheet), made)
+        _point(record, out)
+        return out
 
     def _refit(self, record: np.void, space: Space, finest: float) -> Refit:
         """Clusters where the mesh stands; their numbers are entered."""
@@ -453,6 +471,22 @@ class MeshBody(DynamicBody):
     def nbytes(self) -> int:
         """Room that the vertices take up [bytes]."""
         return self.vertices.nbytes
+
+
+class SheetArrays(NamedTuple):
+    """What records of thin sheets of dielectrics have beside those of :class:`Refit`."""
+
+    faces: Array
+    """By how much energies of functions are less as charge is on both faces [1/m], shape (f,)."""
+    clusters: Refit
+
+
+def _faces(made: Refit, thickness: float) -> Array:
+    """See :class:`SheetArrays`; of parts in the middle of a sheet so thick [m]."""
+    out, split_ = np.zeros(len(made.own)), made.function >= 0
+    less = _on_both_faces(made.charge, thickness)
+    out[made.function[split_]] = less[made.children[split_]].sum(axis=1)
+    return out
 
 
 class LayerArrays(NamedTuple):

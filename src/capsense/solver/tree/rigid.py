@@ -79,6 +79,7 @@ BODY = np.dtype(
         ("local_tie", np.float64),  # its capacitance to the local ground [m]; 0 for none
         ("inside", np.float64),  # impedance of its inside, over its energy; 0 for a sheet
         ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
+        ("faces", np.int64),  # by how much energies are less as its charge is on both faces [1/m]
         # thickness of a layer of dipoles [m], 0 for charges; mean normals of its clusters; and of
         # each of its pieces three points, normal and area
         ("layer", np.float64), ("normals", np.int64), ("pieces", np.int64),
