@@ -10,6 +10,7 @@
 - :mod:`~capsense.humans.tracked_hand`: a hand that follows them
 - :mod:`~capsense.humans.hand_recording`: files of them
 - :mod:`~capsense.humans.formats`: these as MJCF and URDF; meshes of the SMPL family
+- :mod:`~capsense.humans.rigged`: meshes that follow bones, posed at every step
 """
 
 from capsense.humans.build import Build
@@ -19,6 +20,7 @@ from capsense.humans.ground import capacitance_to_ground
 from capsense.humans.hand_recording import HandRecording
 from capsense.humans.limb import Limb, arm, hand, leg
 from capsense.humans.people import ON_BACK, POSTURES, person
+from capsense.humans.rigged import RiggedMesh, load_gltf, smplx_surface
 from capsense.humans.tracked_hand import TrackedHand
 from capsense.humans.tracking import HandFilter, HandSample, OneEuroFilter
 
@@ -33,12 +35,15 @@ __all__ = [
     "Limb",
     "LimbPart",
     "OneEuroFilter",
+    "RiggedMesh",
     "Segment",
     "TrackedHand",
     "arm",
     "capacitance_to_ground",
     "hand",
     "leg",
+    "load_gltf",
     "load_smplx",
     "person",
+    "smplx_surface",
 ]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import listed
-from capsense.scene.mesh_shape import TriangleShape
+from capsense.scene.mesh_shape import SurfaceMesh, TriangleShape
 from capsense.scene.scene import Body, Scene
 from capsense.scene.shapes import ShapeKind
 
@@ -42,6 +42,9 @@ class Sheets:
         self._middle = self._few.mean(axis=0, keepdims=True)
         arms = np.concatenate([self._few, self._many]) - self._middle
         self._radius = float(np.linalg.norm(arms, axis=1).max()) + touch
+        low, high = self._many.min(axis=0), self._many.max(axis=0)
+        self._wide = np.stack(np.meshgrid(*np.stack([low, high], axis=1)), axis=-1).reshape(-1, 3)
+        self._margin = float(self._reach.max())
         self.bounds = np.array([self._few.min(axis=0) - touch, self._few.max(axis=0) + touch])
         """Corners of a box around all of them [m], shape (2, 3)."""
 
@@ -52,12 +55,20 @@ class Sheets:
         """
         if body.shape.kind == ShapeKind.LAYERS:
             return False
-        if distances(body, self._middle, each=False)[0] > self._radius:
+        near = None
+        if isinstance(body.shape, SurfaceMesh):  # another one at each step
+            corners = body.pose.inverse().apply(self._wide)
+            low, high = corners.min(axis=0) - self._margin, corners.max(axis=0) + self._margin
+            near = body.shape.over(low[:2], high[:2])
+            if not len(near.faces):
+                return False
+        if distances(body, self._middle, each=False, near=near)[0] > self._radius:
             return False
-        off = distances(body, self._few, each=False)
+        off = distances(body, self._few, each=False, near=near)
         close = off[self._nearest] <= self._reach  # others are no nearer than the few around them
         if close.any():
-            off = np.concatenate([off, distances(body, self._many[close], each=False)])
+            more = distances(body, self._many[close], each=False, near=near)
+            off = np.concatenate([off, more])
         return met(off, conducting, self._touch)
 
 
@@ -69,22 +80,28 @@ def met(off: Array, conducting: bool, touch: float = TOUCH) -> bool:
     return bool(off.min() < -touch or (conducting and np.abs(off).min() < touch))
 
 
-def distances(body: Body, points: Array, *, each: bool = True) -> Array:
+def distances(
+    body: Body, points: Array, *, each: bool = True, near: SurfaceMesh | None = None
+) -> Array:
     """Distances of points to a body [m], negative inside; of an open mesh, by its winding.
 
     Of the points that rays find inside an open mesh, ``each`` is made sure, or the deepest only.
+    ``near`` holds the triangles of a changing surface that are looked at, those over and under all
+    points (:meth:`SurfaceMesh.over`).
     """
-    local, shape = body.pose.inverse().apply(points), body.shape
+    local, shape = body.pose.inverse().apply(points), near or body.shape
     if not isinstance(shape, TriangleShape) or shape.closed or not len(points):
         return shape.signed_distance(local)
+    whole = body.shape
+    assert isinstance(whole, TriangleShape)
     off = np.minimum(shape.ray_distance(local), shape.ray_distance(local, down=True))
     inside = off < 0
     if not each:
         deepest = int(off.argmin())
-        if off[deepest] < -TOUCH and not _wound(shape, local[[deepest]], -off[[deepest]])[0]:
+        if off[deepest] < -TOUCH and not _wound(whole, local[[deepest]], -off[[deepest]])[0]:
             inside[:] = False
     else:
-        inside[inside] = _wound(shape, local[inside], -off[inside])
+        inside[inside] = _wound(whole, local[inside], -off[inside])
     return np.where(inside, off, np.abs(off))
 
 

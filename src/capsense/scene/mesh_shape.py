@@ -284,15 +284,38 @@ class SurfaceMesh(TriangleShape):
         """Whether the surface has an inside."""
         return self.rest.closed
 
+    def over(self, low: ArrayLike, high: ArrayLike) -> SurfaceMesh:
+        """The triangles over and under a rectangle, all that rays along z from there may cross.
+
+        Args:
+            low, high: Corners of the rectangle [m] in the local frame, shape (2,).
+        """
+        out = object.__new__(SurfaceMesh)
+        sides = np.zeros(len(self.vertices), np.uint8)  # of the rectangle that a vertex is beyond
+        for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high), strict=True)):
+            along = self.vertices[:, axis]
+            sides |= ((along < least) * (1 << 2 * axis) + (along > most) * (2 << 2 * axis)).astype(
+                np.uint8
+            )
+        a, b, c = (sides[self.faces[:, q]] for q in range(3))
+        faces = read_only(self.faces[(a & b & c) == 0])
+        out.__dict__.update(vertices=self.vertices, faces=faces, rest=self.rest)
+        return out
+
     @cached_property
     def volume(self) -> float:
         self._require_inside("volume")
         return abs(enclosed_volume(self.vertices, self.faces))
 
     def bounds(self) -> Array:
+        return self._bounds
+
+    @cached_property
+    def _bounds(self) -> Array:
         used = self.rest.used
         v = self.vertices if len(used) == len(self.vertices) else self.vertices[used]
-        return np.array([v.min(axis=0), v.max(axis=0)])
+        along = np.ascontiguousarray(v.T)  # NumPy takes six times as long down the columns
+        return read_only(np.array([along.min(axis=1), along.max(axis=1)]))
 
     def _require_inside(self, what: str) -> None:
         if not self.closed:

@@ -174,6 +174,21 @@ class DeformableSurface:
     def vertices(self, vertices: ArrayLike) -> None:
         self._shape = SurfaceMesh(vertices, self._rest)
 
+    def update(self, vertices: ArrayLike, pose: Pose | None = None) -> Body:
+        """Deform the surface, and return it as a body.
+
+        Args:
+            vertices: Points [m], shape (n, 3) or (1, n, 3), as models give that take batches; an
+                array or a tensor of PyTorch, on any device, whose gradients are left out.
+            pose: Frame of the vertices in the sensor frame; the sensor frame itself by default.
+
+        Raises:
+            SceneError: Another shape, numbers that are not finite, or no :class:`Pose`.
+        """
+        points = np.asarray(vertices.detach().cpu() if hasattr(vertices, "detach") else vertices)
+        self.vertices = points[0] if points.ndim == 3 and len(points) == 1 else points
+        return self.body() if pose is None else self.body().moved(pose)
+
     def body(self) -> Body:
         """The surface as it is now, as a body of a scene in the sensor frame."""
         return Body(self._shape, Pose(), self.material, self.grounding, self.name)

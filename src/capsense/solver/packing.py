@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import is_
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,13 @@ from numpy.typing import NDArray
 from capsense.design.film import Film
 from capsense.field.green_kernels import Green
 from capsense.reading import Touch
-from capsense.scene import Scene
-from capsense.scene.geometry_kernels import Boxes
+from capsense.scene import Scene, SurfaceMesh
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape
 from capsense.solver.bodies.outline import CHANGING, write_triangles
 from capsense.solver.gap.gap_kernels import REACH
 from capsense.solver.gap.touch import Pressed
-from capsense.solver.tree.dynamic_surface import DipoleLayer, DynamicBody
+from capsense.solver.tree.dynamic_surface import DipoleLayer, DynamicBody, MeshBody
 from capsense.solver.tree.matter import Matter
 from capsense.solver.tree.near_triangles import Face, near_triangles
 from capsense.solver.tree.rigid import BODY, RigidShape
@@ -58,11 +58,18 @@ class PackedBodies:
     """What they press onto the cover, if the design has one."""
     pressed: Sequence[Pressed] = ()
     """Those that touch the cover."""
-    near: list[Boxes] = field(default_factory=list)
-    """Triangles near the design that records point to."""
+    near: list[NamedTuple] = field(default_factory=list)
+    """Triangles near the design, and clusters of deforming meshes, that records point to."""
 
-    def find_near(self, green: Green) -> None:
-        """Give changing bodies near a face an outline; not sheets of dielectrics."""
+    def refit(self, green: Green, finest: float) -> None:
+        """Work out where the clusters of changing bodies are.
+
+        Those near a face get an outline, but for sheets of dielectrics. Triangles of meshes that
+        are longer than ``finest`` have parts.
+        """
+        for record, shape in zip(self.records, self.shapes, strict=True):
+            if isinstance(shape, MeshBody):
+                self.near.append(shape.enter(record, green.space, finest))
         gap = green.gap
         if not len(gap.areas):
             return
@@ -70,7 +77,8 @@ class PackedBodies:
         face = Face(gap.face, green.box, film, gap.top, gap.top - gap.soft.limit)
         limits = 2.0 * gap.validity, REACH[1] * gap.validity
         for record, shape in zip(self.records, self.shapes, strict=True):
-            if not isinstance(shape, DynamicBody) or record["sheet"] != 0.0:
+            thin = record["sheet"] + record["layer"] != 0.0
+            if thin or not isinstance(shape, DynamicBody):
                 continue
             found = near_triangles(shape, record, face, *limits)
             if found is not None:
@@ -107,15 +115,11 @@ class BodyTemplate:
         return self.records.tobytes()
 
 
-def layer_of(
-    found: tuple[RigidShape | DynamicBody, float], conducting: bool
-) -> list[tuple[DipoleLayer, float]]:
+def layer_of(shape: Shape, conducting: bool) -> list[tuple[DipoleLayer, float]]:
     """The dipoles that go with the charges of a thin sheet of triangles, if it is one."""
-    body, size = found
-    if conducting or not isinstance(body, DynamicBody) or body.sheet == 0.0:
+    if conducting or not isinstance(shape, SurfaceMesh) or shape.closed:
         return []
-    known = body.pieces is not None and body.pieces.normals is not None
-    return [(DipoleLayer(body), size)] if known else []
+    return [(DipoleLayer(shape), 1.0)]
 
 
 def make_template(

@@ -503,7 +503,7 @@ class SurfaceSolver:
         tie_what_is_outside(records, self.green.space)
         out = PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
         if not laid.rigid:
-            out.find_near(self.green)
+            out.refit(self.green, math.inf if self._finest is None else self._finest)
         if self._contact is None:
             return out
         touch, pressed = self._contact.press(records, chosen, view.scene.bodies, time)
@@ -527,7 +527,7 @@ class SurfaceSolver:
                 offsets.append((len(places), at))
             for part in parts:
                 made = self.functions_of(part, conducting[place], share)
-                for body in (made, *layer_of(made, conducting[place])):
+                for body in (made, *layer_of(part, conducting[place])):
                     found.append(body)
                     solved.append(part)
                     places.append(place)

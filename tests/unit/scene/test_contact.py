@@ -36,6 +36,30 @@ def test_sheets_meet_what_their_points_meet(shape: cs.Shape | str) -> None:
     assert 5 < sum(met) < 55
 
 
+@pytest.mark.parametrize("opened", [False, True])
+def test_surfaces_that_change_meet_what_rigid_ones_do(opened: bool) -> None:
+    """Differential: of their triangles, those over and under the sheets tell as much as all."""
+    ball, sheets, rng, met = (
+        cs.Sphere(0.02).to_trimesh(),
+        Sheets(PADS),
+        np.random.default_rng(5),
+        [],
+    )
+    stretched = ball.vertices * [1.0, 2.0, 0.5]
+    faces = ball.faces[ball.vertices[ball.faces][:, :, 1].max(axis=1) < 0.017] if opened else (
+        ball.faces)  # fmt: skip
+    soft = cs.DeformableSurface(ball.vertices, faces)
+    rigid = cs.TriMesh(stretched, faces)
+    for _ in range(150):
+        place = cs.Pose(rng.uniform(-0.05, 0.05, 3), rng.normal(size=4))
+        changing = soft.update(stretched, place)
+        for conducting in (False, True):
+            expected = sheets.meet(cs.Body(rigid, place, "steel"), conducting)
+            assert sheets.meet(changing, conducting) == expected
+            met.append(expected)
+    assert 20 < sum(met) < 280
+
+
 @pytest.mark.parametrize(
     ("height", "words"),
     [

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rigged import over_square
 
 import capsense as cs
 from capsense.scene import RestSurface
-from capsense.solver.tree.dynamic_surface import DynamicBody, layout_of, mesh_pieces
+from capsense.solver.tree.dynamic_surface import MeshBody, layout_of
 from capsense.solver.tree.inside import table_of
 
 LENGTH, WIDTH, THICKNESS = 0.2, 0.1, 1e-3
@@ -96,8 +97,10 @@ def test_charge_on_both_faces(thickness: float) -> None:
         np.array([[0, 1, 2], [0, 2, 3]]),
         thickness=thickness,
     )  # its first function is of two triangles, each as large as the square
-    shape = surface.body().shape
-    found = DynamicBody(*mesh_pieces(shape), sheet=thickness)
+    body = MeshBody(surface.body().shape, False)
+    record = body.record.copy()
+    record["rotation"] = np.eye(3)
+    found = body.enter(record, over_square(), 1.0)
     x, w = np.polynomial.legendre.leggauss(200)
     x, w = (0.5 * (x + 1)) ** 3, 1.5 * w * (0.5 * (x + 1)) ** 2
     u, v = np.meshgrid(x, x)
@@ -107,4 +110,4 @@ def test_charge_on_both_faces(thickness: float) -> None:
         return float((4 * np.outer(w, w) * (1 - u) * (1 - v) / np.sqrt(u**2 + v**2 + off**2)).sum())
 
     wanted = 2 * (mean(1e-9) - mean(thickness / side)) / (2 * side)
-    np.testing.assert_allclose(found._faces[:2], [0.0, wanted], rtol=0.05)
+    np.testing.assert_allclose(found.faces[:2], [0.0, wanted], rtol=0.05)

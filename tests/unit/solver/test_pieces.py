@@ -52,10 +52,10 @@ def test_triangles_against_random_points() -> None:
     """Statistical: centres, areas and moments of some triangles, by 200,000 points on each."""
     rng = np.random.default_rng(0)
     vertices, faces = sheared(20)
-    _, found = mesh_pieces(SurfaceMesh(vertices, RestSurface(vertices, faces)))
-    assert len(found.areas) == 800
+    layout, found = mesh_pieces(SurfaceMesh(vertices, RestSurface(vertices, faces)))
+    assert sorted(map(tuple, layout.corner.tolist())) == sorted(map(tuple, faces.tolist()))
     for k in (0, 17, 400, 799):
-        a, b, c = vertices[faces[k]]
+        a, b, c = vertices[layout.corner[k]]
         u, v = rng.random((2, 200_000, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         p = a + u * (b - a) + v * (c - a)
@@ -73,12 +73,12 @@ def test_parts_of_large_triangles_are_parts(n: int) -> None:
     rest = RestSurface(vertices, faces)
     _, p = mesh_pieces(SurfaceMesh(vertices, rest))
     assert 500 <= len(p.areas) < 2500
-    face = module.layout_of(rest).face
+    inside = module.layout_of(rest).corner
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     longest = np.sqrt(np.trace(p.moments, axis1=1, axis2=2).max())
     assert longest < 2 * np.sqrt(p.areas.sum() / 500) / np.sqrt(12)
     for k in range(len(faces)):
-        of = face == k
+        of = (inside == faces[k]).all(axis=1)
         share = p.areas[of]
         whole = np.linalg.norm(np.cross(b[k] - a[k], c[k] - a[k])) / 2
         assert share.sum() == approx(whole)
@@ -121,16 +121,17 @@ def test_clusters_are_those_of_the_surface_at_rest() -> None:
     """Invariant: one tree for every instant, of neighbours; forgotten with its surface."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     rest = RestSurface(ball.vertices, ball.faces)
-    first, _ = mesh_pieces(SurfaceMesh(ball.vertices, rest))
+    first, pieces = mesh_pieces(SurfaceMesh(ball.vertices, rest))
     rng = np.random.default_rng(1)
     second, _ = mesh_pieces(SurfaceMesh(ball.vertices + rng.normal(size=(642, 3)), rest))
     assert second is first
+    layout = weakref.ref(first)
+    first = first.tree
     assert sorted(leaves(first, 0)) == list(range(1280))
     parts = [leaves(first, k) for k in first.children[0]]
     assert 320 <= len(parts[0]) <= 960
-    middles = [ball.triangles_center[p].mean(axis=0) for p in parts]
+    middles = [pieces.centers[p].mean(axis=0) for p in parts]
     assert np.linalg.norm(middles[0] - middles[1]) > 0.03
-    layout = weakref.ref(module.layout_of(rest))
     del rest, first, second
     gc.collect()
     assert layout() is None

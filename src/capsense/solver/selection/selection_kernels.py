@@ -130,7 +130,8 @@ def choose(bodies, looks, first, threshold, width, facing):
     for b in range(bodies.shape[0]):
         queue = _with_room(queue, count, 2 * bodies[b].n - 1)
         _put(queue, count, b, (np.int64(0), first[b]), looks.score[first[b]], 1.0)
-        count, more = _split(bodies, b, looks, queue, count, (threshold, width), facing)
+        limits = threshold / (1.0 + bodies[b].demand), width
+        count, more = _split(bodies, b, looks, queue, count, limits, facing)
         leaves += more
     return _collect(bodies, queue, count, leaves)
 

@@ -9,15 +9,31 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.field.face_kernels import Space
 from capsense.scene import Layers, RestSurface, SurfaceMesh
 from capsense.solver.bodies.panels import SurfacePanels
 from capsense.solver.tree import tree_kernels
-from capsense.solver.tree.rigid import BODY, INSIDE, Clusters, features, split
+from capsense.solver.tree.refit_kernels import (
+    Refit,
+    count_halves,
+    pieces_of,
+    pieces_within,
+    refit,
+)
+from capsense.solver.tree.rigid import (
+    BODY,
+    HALF_SPACE,
+    INSIDE,
+    Clusters,
+    features,
+    split,
+)
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -33,6 +49,13 @@ _HALVINGS = 60
 """Triangles are halved at most so often."""
 _LEAST_AREA = 1e-9
 """Smallest area of a piece, as a part of the mean: those that shrink to a line have none."""
+_APART = 0.02
+"""Opposite normals of a mesh count as twice so far apart at most [m], in telling faces apart: those
+of a finger are, hands and trunks are cut across first. A cluster of one face of several fingers is
+not met well as a rectangle."""
+_DEMAND = 2.0
+"""Functions of a mesh count from a score on that is this plus one times lower than usual: they are
+weighted with areas, so that more of them are needed than of rigid bodies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +72,6 @@ class PieceArrays:
     """Corners of triangles [m], shape (n, 3, 3); None for rectangles, which moments tell."""
     grid: tuple[int, int, int] = 0, 0, 0
     """Images, rows and columns of the first pieces, which are pixels."""
-    normals: Array | None = None
-    """Unit normals of triangles, shape (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,24 +79,37 @@ class PieceLayout:
     """How the n pieces of a deforming surface lie in its triangles."""
 
     face: Ints
-    """Triangle that a piece belongs to, shape (n,)."""
+    """The triangle that each lies in, shape (n,)."""
+    corner: Ints
+    """Vertices of the triangle that a piece belongs to, shape (n, 3)."""
     shares: Array
-    """Corners of the pieces as shares of the triangle's corners, shape (n, 3, 3)."""
+    """Corners of the pieces as shares of the triangle's corners, shape (n, 3, 3); empty where all
+    pieces are whole triangles."""
+    first: Array
+    """Corners of the pieces as they were first [m], shape (n, 3, 3)."""
+    longest: Array
+    """Their longest edges then [m], shape (n,)."""
+    least: float
+    """Smallest area of a piece [m²]."""
     tree: Clusters
     """Clusters of all pieces, from the form that the surface had first."""
+    order: Ints
+    """The pieces, those of a cluster one after another, shape (n,)."""
+    capacitance: float
+    """About that of the surface in free space over 4π eps0 [m]."""
 
 
 _LAYOUTS: WeakKeyDictionary[RestSurface, PieceLayout] = WeakKeyDictionary()
 
 
-def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, PieceArrays]:
+def mesh_pieces(shape: SurfaceMesh) -> tuple[PieceLayout, PieceArrays]:
     """The triangles of a deforming surface, long and large ones cut into parts, a piece each.
 
     Returns:
-        Clusters of all pieces, the same ones at every instant; and the pieces.
+        How the pieces lie in the triangles, the same at every instant; and the pieces.
     """
     cut = layout_of(shape.rest)
-    return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)
+    return cut, _pieces(shape.vertices, cut.corner, cut.shares, cut.least)
 
 
 def layout_of(rest: RestSurface) -> PieceLayout:
@@ -106,22 +140,39 @@ def _cut(rest: RestSurface) -> PieceLayout:
         other[row, start] = middle
         shares[long, end] = middle
         face, shares = np.concatenate([face, face[long]]), np.concatenate([shares, other])
-    first = _pieces(rest.vertices, rest.faces, face, shares)
-    assert first.normals is not None
-    return PieceLayout(face, shares, split(features(first.centers, first.normals), first.areas))
+    if len(face) == len(corners):
+        shares = np.empty((0, 3, 3))
+    corner = np.ascontiguousarray(rest.faces[face])
+    found = _pieces(rest.vertices, corner, shares, 0.0)
+    assert found.corners is not None
+    least = max(_LEAST_AREA * float(found.areas.mean()), 1e-300)
+    areas = np.maximum(found.areas, least)
+    edges = np.roll(found.corners, -1, axis=1) - found.corners
+    tree = split(features(found.centers, normals_of(found.corners), _APART), areas)
+    size = DynamicBody(tree, PieceArrays(found.centers, areas, found.moments)).capacitance
+    # pieces stand in the order of their clusters, so that memory is read from end to end
+    single = np.flatnonzero(tree.panel >= 0)
+    at = tree.panel[single]
+    tree.panel[single] = np.arange(len(at))
+    return PieceLayout(
+        face[at], corner[at], shares[at] if len(shares) else shares, found.corners[at],
+        np.linalg.norm(edges[at], axis=2).max(axis=1), least, tree,
+        tree_kernels.in_order(tree.children, tree.panel), size,
+    )  # fmt: skip
 
 
-def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> PieceArrays:
+def _pieces(vertices: Array, corner: Ints, shares: Array, least: float) -> PieceArrays:
     """Pieces, see :class:`PieceLayout`."""
-    corners = shares @ vertices[faces[face]]
-    centers = corners.mean(axis=1)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.linalg.norm(normals, axis=1)
-    normals /= np.maximum(double, 1e-300)[:, None]
-    areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / 2
-    arms = corners - centers[:, None]
-    moments = arms.transpose(0, 2, 1) @ arms / 12
-    return PieceArrays(centers, areas, moments, corners, normals=normals)
+    n = len(corner)
+    out = np.empty((n, 3)), np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    pieces_of(np.ascontiguousarray(vertices), corner, shares, *out)
+    return PieceArrays(out[0], np.maximum(out[1], least), out[2], out[3])
+
+
+def normals_of(corners: Array) -> Array:
+    """Unit normals of triangles, (n, 3, 3) -> (n, 3)."""
+    out = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1), 1e-300)[:, None])
 
 
 def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool_], float]:
@@ -301,10 +352,7 @@ class DynamicBody:
         for name in ("children", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
         if sheet > 0.0:
-            self._faces = np.zeros(n)
-            if self.pieces is not None and self.pieces.normals is not None:  # not of an image
-                less = _on_both_faces(self._charge, sheet)
-                self._faces[self._function[~single]] = less[self._children[~single]].sum(axis=1)
+            self._faces = np.zeros(n)  # of an image
             record["faces"] = self._faces.ctypes.data
         self.record = record
 
@@ -352,38 +400,148 @@ def _on_both_faces(area: Array, thickness: float) -> Array:
     return math.pi * thickness / (area + 2.0 * math.pi / square * thickness * np.sqrt(area))
 
 
-class DipoleLayer(DynamicBody):
+class MeshBody(DynamicBody):
+    """A deforming mesh at one instant. Where it stands, :meth:`enter` completes its record.
+
+    Args:
+        shape: The mesh.
+        conducting: Whether it is a conductor. Triangles of others are not divided near a design:
+            what is known of their inside is that of their pieces.
+    """
+
+    def __init__(self, shape: SurfaceMesh, conducting: bool) -> None:
+        self.sheet = 0.0 if shape.closed else shape.rest.thickness
+        self._layout, self.vertices = layout_of(shape.rest), np.ascontiguousarray(shape.vertices)
+        self.capacitance, self._divided = self._layout.capacitance, conducting
+        self.record = np.zeros(1, BODY)[0]
+        self.record["scale"], self.record["capacitance"] = 1.0, self.capacitance
+        self.record["inside"] = HALF_SPACE if self.sheet == 0.0 else 0.0
+        self.record["demand"] = _DEMAND if conducting else 0.0
+
+    def enter(self, record: np.void, space: Space, finest: float) -> NamedTuple:
+        """Complete the record of the mesh where it stands; clusters near a design are divided.
+
+        Args:
+            record: Where it stands; changed.
+            space: Surroundings of the design.
+            finest: Triangles with no edge longer than this at rest stay whole [m].
+
+        Returns:
+            What the record points to.
+        """
+        made = self._refit(record, space, finest if self._divided else math.inf)
+        _point(record, made)
+        if self._divided or self.sheet == 0.0:
+            return made
+        out = SheetArrays(_faces(made, self.sheet), made)
+        _point(record, out)
+        return out
+
+    def _refit(self, record: np.void, space: Space, finest: float) -> Refit:
+        """Clusters where the mesh stands; their numbers are entered."""
+        cut = self._layout
+        place = record["scale"] * record["rotation"], record["position"].copy()
+        pieces = cut.corner, cut.shares, cut.first, cut.longest
+        halves = count_halves(self.vertices, pieces, place, space, finest)
+        tree = cut.tree.children, cut.tree.function, cut.tree.panel
+        limits = cut.least, finest, OWN
+        made = refit(self.vertices, pieces, tree, halves, place, space, limits)
+        record["n"], record["n_panel_clusters"] = len(made.own), len(made.charge)
+        return made
+
+    def corners_within(
+        self, turn: Array, position: Array, walls: Array, low: float, high: float
+    ) -> Array | None:
+        """Corners of the pieces that reach between walls and below a height [m], (k, 3, 3).
+
+        Args:
+            turn, position: Where the mesh stands: rotation, times its size, and position.
+            walls: Along x and y, shape (2, 2).
+            low, high: Heights; None is returned where nothing reaches below the first.
+        """
+        at = self.vertices @ turn.T + position
+        if at[:, 2].min() >= low:
+            return None
+        cut = self._layout
+        chosen = pieces_within(at, cut.corner, cut.order, walls, high)
+        corners = self.vertices[cut.corner[chosen]]
+        return corners if not len(cut.shares) else cut.shares[chosen] @ corners
+
+    @property
+    def nbytes(self) -> int:
+        """Room that the vertices take up [bytes]."""
+        return self.vertices.nbytes
+
+
+class SheetArrays(NamedTuple):
+    """What records of thin sheets of dielectrics have beside those of :class:`Refit`."""
+
+    faces: Array
+    """By how much energies of functions are less as charge is on both faces [1/m], shape (f,)."""
+    clusters: Refit
+
+
+def _faces(made: Refit, thickness: float) -> Array:
+    """See :class:`SheetArrays`; of parts in the middle of a sheet so thick [m]."""
+    out, split_ = np.zeros(len(made.own)), made.function >= 0
+    less = _on_both_faces(made.charge, thickness)
+    out[made.function[split_]] = less[made.children[split_]].sum(axis=1)
+    return out
+
+
+class LayerArrays(NamedTuple):
+    """What records of layers of dipoles have beside those of :class:`Refit`; k clusters."""
+
+    normals: Array
+    """Mean normals of clusters, shape (k, 3)."""
+    own: Array
+    """Energy of each function across the sheet [1/m], shape (f,)."""
+    pieces: Array
+    """Of each piece three points [m], its normal and its area [m²], shape (n, 13)."""
+    clusters: Refit
+
+
+class DipoleLayer(MeshBody):
     """The dipoles across a thin sheet of a dielectric, on the clusters of its charges.
 
     A charge function is an even layer of charge on the front of its cluster, and the opposite one
     on the back; see ``interaction.layer_kernels``.
 
     Args:
-        sheet: The sheet, of triangles.
+        shape: The sheet.
     """
 
-    def __init__(self, sheet: DynamicBody) -> None:
-        pieces = sheet.pieces
-        assert pieces is not None
-        assert pieces.normals is not None
+    def __init__(self, shape: SurfaceMesh) -> None:
+        super().__init__(shape, False)
+        self._thickness, self.sheet = self.sheet, 0.0
+        self.record["layer"] = self._thickness
+
+    def enter(self, record: np.void, space: Space, finest: float) -> NamedTuple:
+        """Complete the record of the layer, as of :meth:`MeshBody.enter`."""
+        made, cut = self._refit(record, space, math.inf), self._layout
+        pieces = _pieces(self.vertices, cut.corner, cut.shares, cut.least)
         assert pieces.corners is not None
-        self.sheet, self.pieces, self._sheet = 0.0, None, sheet
-        self._panel, self._extent, self._center = sheet._panel, sheet._extent, sheet._center
-        self.capacitance = sheet.capacitance
-        children, area, split_ = sheet._children, sheet._charge, sheet._panel < 0
-        self._normals = np.empty((len(children), 3))
-        self._normals[~split_] = pieces.normals[sheet._panel[~split_]]
-        tree_kernels.means(children, area, self._normals)
-        across = 4.0 * math.pi * sheet.sheet
-        self._own = np.empty((len(children) + 1) // 2)
-        self._own[0] = across / area[0]
-        first, second = children[split_].T
-        self._own[sheet._function[split_]] = across * (1.0 / area[first] + 1.0 / area[second])
-        self.record = record = sheet.record.copy()
-        record["sheet"], record["inside"], record["layer"] = 0.0, 0.0, sheet.sheet
+        normal, split_ = normals_of(pieces.corners), cut.tree.panel < 0
+        normals = np.empty((len(made.charge), 3))
+        normals[~split_] = normal[cut.tree.panel[~split_]]
+        tree_kernels.means(made.children, made.charge, normals)
+        across = 4.0 * math.pi * self._thickness
+        own = np.empty(len(made.own))
+        own[0] = across / made.charge[0]
+        first, second = made.charge[made.children[split_]].T
+        own[made.function[split_]] = across * (1.0 / first + 1.0 / second)
         inner = pieces.centers[:, None] + 0.5 * (pieces.corners - pieces.centers[:, None])
-        self._pieces = np.concatenate(  # which are good to the second order, at Gauss points
-            [inner.reshape(-1, 9), pieces.normals, pieces.areas[:, None]], axis=1
+        whole = np.concatenate(  # which are good to the second order, at Gauss points
+            [inner.reshape(-1, 9), normal, pieces.areas[:, None]], axis=1
         )
-        for name in ("own", "normals", "pieces"):
-            record[name] = getattr(self, f"_{name}").ctypes.data
+        out = LayerArrays(normals, own, whole, made)
+        _point(record, made)
+        _point(record, out)
+        return out
+
+
+def _point(record: np.void, arrays: NamedTuple) -> None:
+    """Let the fields of a record point to arrays of these names."""
+    for name, values in arrays._asdict().items():
+        if isinstance(values, np.ndarray):  # `.ctypes` takes much longer
+            record[name] = values.__array_interface__["data"][0]

@@ -22,7 +22,7 @@ from capsense.scene import RestSurface, TriMesh
 from capsense.scene.surface import enclosed_volume
 from capsense.solver.bodies.blocks import free_block, impedance
 from capsense.solver.bodies.panels import SurfacePanels, panels_of
-from capsense.solver.tree.dynamic_surface import PieceLayout, layout_of
+from capsense.solver.tree.dynamic_surface import PieceLayout, layout_of, normals_of
 from capsense.solver.tree.rigid import HALF_SPACE, Clusters, features
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ def _sheet(rest: RestSurface) -> Array32 | None:
         return None
     rows = np.repeat(np.arange(len(place)), 3)
     spread = csr_array((nodes.ravel(), (rows, faces[place].ravel())), (len(place), len(v)))
-    means, area = _cluster_means(layout, rest, spread)
+    means, area = _cluster_means(layout, spread)
     load = _differences(layout.tree, means, area)
     first = np.unique(part, return_index=True)[1]
     free = np.setdiff1d(np.arange(len(v)), first)
@@ -107,6 +107,8 @@ def _welded(vertices: Array) -> tuple[Array, Ints]:
 
 def _shares(layout: PieceLayout) -> Array:
     """Middles of the pieces as shares of their triangles' corners, shape (n, 3)."""
+    if not len(layout.shares):
+        return np.full((len(layout.face), 3), 1.0 / 3.0)
     return np.asarray(layout.shares.mean(axis=1))
 
 
@@ -143,12 +145,10 @@ def _laplacian(v: Array, faces: Ints) -> csr_array:
     return csr_array(out.tocsr() + coo_array((np.ones(len(lone)), (lone, lone)), out.shape).tocsr())
 
 
-def _cluster_means(
-    layout: PieceLayout, rest: RestSurface, spread: csr_array
-) -> tuple[Array, Array]:
+def _cluster_means(layout: PieceLayout, spread: csr_array) -> tuple[Array, Array]:
     """Means over the first clusters of what pieces carry to nodes, (k, nodes), and areas (k,)."""
     tree = layout.tree
-    areas = _areas(layout, rest)
+    areas = _areas(layout)
     count = min(2 * min(len(areas), _FUNCTIONS) - 1, len(tree.children))
     parent = np.zeros(len(tree.children), np.int64)
     wholes = np.flatnonzero(tree.panel < 0)
@@ -169,9 +169,9 @@ def _cluster_means(
     return np.asarray((diags_array(1.0 / area) @ member @ spread).toarray()), area
 
 
-def _areas(layout: PieceLayout, rest: RestSurface) -> Array:
+def _areas(layout: PieceLayout) -> Array:
     """Areas of the pieces of a surface in its first form, shape (n,)."""
-    corners = layout.shares @ rest.vertices[rest.faces[layout.face]]
+    corners = layout.first
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(cross, axis=1)
     return np.maximum(double, 1e-9 * double.mean()) / 2
@@ -205,16 +205,15 @@ def _carried(
     panels: SurfacePanels, block: Array, layout: PieceLayout, rest: RestSurface
 ) -> Array32:
     """A block of some panels (p, p) on the charge functions of a surface, (f, f)."""
-    corners = layout.shares @ rest.vertices[rest.faces[layout.face]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    corners = layout.first
+    normals = normals_of(corners)
     if enclosed_volume(rest.vertices, rest.faces) < 0.0:  # they wind the other way round
         normals = -normals
     on = cKDTree(features(panels.centers, panels.normals)).query(
         features(corners.mean(axis=1), normals)
     )[1]
     shares = csr_array((np.ones(len(on)), (np.arange(len(on)), on)), (len(on), len(panels)))
-    means, area = _cluster_means(layout, rest, shares)
+    means, area = _cluster_means(layout, shares)
     load = _differences(layout.tree, means, area)
     out = np.asarray(load @ block @ load.T)
     out[0] = out[:, 0] = 0.0

@@ -5,6 +5,7 @@ They are made at each step from the pieces near the face alone.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled
 from capsense.design.film import Film
 from capsense.scene.geometry_kernels import Boxes, enclosed
-from capsense.solver.tree.dynamic_surface import STEP_SLOPE, DynamicBody, PieceArrays
+from capsense.solver.tree.dynamic_surface import STEP_SLOPE, DynamicBody, MeshBody, PieceArrays
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,16 +53,21 @@ def near_triangles(
     Returns:
         The triangles in the frame of the body.
     """
-    if body.pieces is None:
-        return None
     scale = float(record["scale"])
     turn, position = scale * record["rotation"], record["position"]
     walls = face.box[:, :2] + [[-reach], [reach]]
-    chosen = _within(body.pieces.centers, body.pieces.moments, body.order, turn, scale, position,
-                     walls, face.top + reach)  # fmt: skip
-    if not len(chosen):
+    if isinstance(body, MeshBody):
+        low = math.inf if face.film is not None else face.top + near
+        found = body.corners_within(turn, position, walls, low, face.top + reach)
+        corners = np.empty((0, 3, 3)) if found is None else found
+    elif body.pieces is None:
         return None
-    corners = _triangles_of(body.pieces, body.order, chosen)
+    else:
+        chosen = _within(body.pieces.centers, body.pieces.moments, body.order, turn, scale,
+                         position, walls, face.top + reach)  # fmt: skip
+        corners = _triangles_of(body.pieces, body.order, chosen)
+    if not len(corners):
+        return None
     placed = corners @ turn.T + position
     if face.film is not None:
         placed = face.film.coordinates(placed)

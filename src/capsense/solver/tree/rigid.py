@@ -86,6 +86,7 @@ BODY = np.dtype(
         ("inverse_susceptibility", np.float64),  # 1 / (eps - 1), 0 for a conductor
         # about what its inside adds to energies, over them, as it scores
         ("polarization_stiffness", np.float64),
+        ("demand", np.float64),  # functions count from a threshold on that is 1 plus this lower
     ]
 )  # fmt: skip
 """One body, as the kernels take it."""

@@ -34,7 +34,7 @@ from capsense.scene import (
 from capsense.scene.shapes import ShapeKind
 from capsense.solver.bodies.outline import write_outline
 from capsense.solver.bodies.panels import panels_of, polygon_panels
-from capsense.solver.tree.dynamic_surface import DynamicBody, layer_pieces, mesh_pieces
+from capsense.solver.tree.dynamic_surface import DynamicBody, MeshBody, layer_pieces
 from capsense.solver.tree.fine_panels import (
     FACES,
     FinePanelBody,
@@ -44,7 +44,6 @@ from capsense.solver.tree.fine_panels import (
 )
 from capsense.solver.tree.inside import table_of
 from capsense.solver.tree.rigid import (
-    HALF_SPACE,
     Clusters,
     RigidShape,
     charged_tree,
@@ -186,12 +185,9 @@ def functions_of(
 
 def _surface(shape: SurfaceMesh, conducting: bool) -> DynamicBody:
     """A surface that deforms; of dielectrics with what is known of their inside."""
-    sheet = 0.0 if shape.closed else shape.rest.thickness
-    out = DynamicBody(*mesh_pieces(shape), sheet=sheet)
+    out = MeshBody(shape, conducting)
     if not conducting:
         out.table = table_of(shape.rest)
-        if shape.closed:
-            out.record["inside"] = HALF_SPACE
     return out
 
 
