@@ -37,8 +37,9 @@ CHARGE_DECADES = 3.0
 SEEN_THROUGH = 0.3
 """Opacity of what hides a sensor."""
 DEPTH = 0.01
-"""A line of sight that runs so far [m] through a solid is blocked; less is a grazed edge, or the
-face that an electrode is on."""
+"""A line of sight that runs so far [m] through a solid is blocked; less is a grazed edge."""
+SUNK = 5e-4
+"""What is no higher than this above a solid's face [m] is drawn in it, not on it."""
 
 
 def colour_of(material: Material) -> Colour:
@@ -74,7 +75,7 @@ def faces_of_hull(shape: Shape) -> Array:
 
 
 def blocks(faces: Array, eye: Array, points: Array) -> bool:
-    """Whether a convex body stands between a place and any of some points.
+    """Whether a convex body stands between a place and any of some points, or holds one.
 
     Args:
         faces: As of :func:`faces_of_hull`.
@@ -91,4 +92,5 @@ def blocks(faces: Array, eye: Array, points: Array) -> bool:
     first = np.clip(enter.max(axis=1), 0.0, 1.0)
     last = np.clip(leave.min(axis=1), 0.0, 1.0)
     inside = (last - first) * np.linalg.norm(ways, axis=1)
-    return bool((inside > DEPTH).any())
+    sunk = (points @ faces[:, :3].T + faces[:, 3]).max(axis=1) < SUNK
+    return bool((sunk | (inside > DEPTH)).any())

@@ -111,7 +111,8 @@ def line_legend(labels: Sequence[str]) -> str:
         for label, colour in zip(labels, COLOURS, strict=False)
     )
     return (
-        '<div class="lines" style="padding:0.3em 0.8em 0;font-size:11px;text-align:center">'
+        '<div class="lines" style="padding:0.3em 0.8em 0;font-size:11px;display:flex;'
+        'flex-wrap:wrap;justify-content:center">'
         f"{marks}</div>"
     )
 
@@ -189,7 +190,7 @@ def touch_table(names: Sequence[str], touch: Touch, limit: float) -> str:
     style = "width:100%;border-collapse:collapse;font-size:11px;text-align:right;line-height:1.7"
     return (
         '<div style="padding:0 0.6em 0.6em"><div style="font-size:13px;text-align:center">'
-        f"touch: force and compression, {touch.total:.3g} N in total</div>"
+        f"touch: force (arrows) and compression, {touch.total:.3g} N in total</div>"
         f'<table class="touch" style="{style}">{"".join(rows)}</table></div>'
     )
 

@@ -105,17 +105,15 @@ class _Robot:
             drawn.pose = solid.pose
             _put(drawn.handle, solid.pose)
 
-    def see_through(self, eyes: Array, points: Array) -> None:
-        """Let the solids be transparent that hide some points from any of some eyes.
+    def see_through(self, sights: Sequence[tuple[Array, Array]]) -> None:
+        """Let the solids be transparent that hide something.
 
         Args:
-            eyes: Where they are [m], shape (e, 3).
-            points: What is looked at [m], shape (n, 3).
+            sights: Where eyes are [m], shape (3,), and what each looks at [m], shape (n, 3).
         """
         for drawn in self._around:
             away = drawn.pose.inverse()
-            seen = away.apply(points)
-            hides = any(blocks(drawn.faces, eye, seen) for eye in away.apply(eyes))
+            hides = any(blocks(drawn.faces, away.apply(eye), away.apply(p)) for eye, p in sights)
             opacity = SEEN_THROUGH if hides else None
             if drawn.handle.opacity != opacity:
                 drawn.handle.opacity = opacity
@@ -177,7 +175,7 @@ class SceneDrawing(_Robot):
         low, high = np.array([e.surface.bounds for e in design.electrodes]).transpose(1, 0, 2)
         middle = (low.min(axis=0) + high.max(axis=0)) / 2
         reach = max(0.08, float(np.ptp([low.min(axis=0), high.max(axis=0)], axis=0).max()))
-        self.views = {"sensor": _view(middle + np.array([0.0, 0.0, 0.4 * reach]), 3.6 * reach)}
+        self.views = {"sensor": _view(middle + np.array([0.0, 0.0, 0.4 * reach]), 3.7 * reach)}
         if robot is not None:
             self.views["robot"] = _view_of(robot, self._middles)
         _look_at(server, self.views)
@@ -196,7 +194,7 @@ class SceneDrawing(_Robot):
 
     def reveal(self, eyes: Array) -> None:
         """Let solids be transparent that hide electrodes from eyes [m], shape (e, 3)."""
-        self.see_through(eyes, self._middles)
+        self.see_through([(eye, self._middles) for eye in eyes])
 
     def show_signals(self, strength: Array) -> None:
         """Colour the electrodes by their signals, 0 to 1, shape (M,)."""
@@ -291,23 +289,25 @@ class SceneDrawing(_Robot):
 
     def _draw_stack(self, design: Design) -> None:
         for k, layer in enumerate(design.layers):
+            opacity = SEEN_THROUGH if _covers(layer.surface, design) else None
             if layer.facets:
-                self._sheet(f"/layers/{k}", layer.surface, LAYER)
+                self._sheet(f"/layers/{k}", layer.surface, LAYER, opacity)
                 continue
             less = min(SHRUNK, 0.2 * float(layer.upper[2] - layer.lower[2]))
             size = layer.upper - layer.lower - [0.0, 0.0, 2 * less]
             self._scene.add_box(
                 f"/layers/{k}", color=LAYER, dimensions=tuple(size),
-                position=(layer.lower + layer.upper) / 2, cast_shadow=False,
+                position=(layer.lower + layer.upper) / 2, cast_shadow=False, opacity=opacity,
             )  # fmt: skip
         for k, conductor in enumerate(design.conductors):
             colour = bytes.fromhex(ROLE_COLOURS[conductor.role].removeprefix("#"))
-            self._sheet(f"/conductors/{k}", conductor.surface, tuple(colour))
+            opacity = SEEN_THROUGH if _covers(conductor.surface, design) else None
+            self._sheet(f"/conductors/{k}", conductor.surface, tuple(colour), opacity)
 
-    def _sheet(self, name: str, surface: Surface, colour: Any) -> None:
+    def _sheet(self, name: str, surface: Surface, colour: Any, opacity: float | None) -> None:
         corners = surface.triangles.reshape(-1, 3)
         faces = np.arange(len(corners)).reshape(-1, 3)
-        self._mesh(name, corners, faces, colour, flat_shading=True, side="double")
+        self._mesh(name, corners, faces, colour, flat_shading=True, side="double", opacity=opacity)
 
     def _named(self, number: int, body: Body, label: str | None) -> tuple[Any, ...]:
         """A body, what is drawn of it, and its label, if it has one."""
@@ -395,7 +395,7 @@ class SkinDrawing:
         ]
         self._robot = _Robot(server.scene)
         self._largest_force = 0.0
-        self._places = middles
+        self._places, self._outwards = middles, np.zeros_like(middles)
         around = max(0.15, 0.3 * float(np.linalg.norm(np.ptp(middles, axis=0))))
         box = np.stack([middles.min(axis=0) - around, middles.max(axis=0) + around])
         self.views = {"skin": _view_of(box, middles)}
@@ -417,11 +417,17 @@ class SkinDrawing:
             _put(self._frames[name], part.pose)
             drawing.show_signals(part.changes / loudest)
             drawing.show_touch(part.touch, self._largest_force)
-        self._places = np.array([part.pose.position for part in frame.skin.values()])
+        poses = [part.pose for part in frame.skin.values()]
+        self._places = np.array([pose.position for pose in poses])
+        self._outwards = np.array([pose.rotation[:, 2] for pose in poses])
 
     def reveal(self, eyes: Array) -> None:
-        """Let solids be transparent that hide sensors from eyes [m], shape (e, 3)."""
-        self._robot.see_through(eyes, self._places)
+        """Let solids be transparent that hide sensors which face eyes [m], shape (e, 3)."""
+        sights = []
+        for eye in eyes:
+            facing = ((eye - self._places) * self._outwards).sum(axis=1) > 0.0
+            sights.append((eye, self._places[facing]))
+        self._robot.see_through(sights)
 
 
 View = tuple[Array, Array]
@@ -449,6 +455,16 @@ def _look_at(server: ViserServer, views: Mapping[str, View]) -> None:
     camera = server.initial_camera
     camera.near, camera.far, camera.fov = 1e-3, FAR, FIELD_OF_VIEW
     camera.position, camera.look_at = list(views.values())[-1]
+
+
+def _covers(surface: Surface, design: Design) -> bool:
+    """Whether some of a layer or a sheet is in front of an electrode."""
+    low, high = surface.bounds
+    return any(
+        low[2] >= e.surface.bounds[1, 2] and (low[:2] < e.surface.bounds[1, :2]).all()
+        and (high[:2] > e.surface.bounds[0, :2]).all()
+        for e in design.electrodes
+    )  # fmt: skip
 
 
 def _normal(surface: Surface) -> Array:
