@@ -20,7 +20,7 @@ from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import DepthFrame, Pose, Scene, Shape
 from capsense.simulator import Simulator
 from capsense.skin import Skin
-from capsense.viewer.frame import Placed, SkinPart
+from capsense.viewer.frame import SkinPart, SolidView
 from capsense.viewer.player import Follower
 from capsense.viewer.source import Frame, Stream
 
@@ -182,7 +182,7 @@ class _Solids:
         self._source = next(iter(sensors)).source
         self._known: tuple[int, list[Solid]] = (-1, [])
 
-    def now(self, view: Pose) -> tuple[Placed, ...]:
+    def now(self, view: Pose) -> tuple[SolidView, ...]:
         """The solids at present, in the frame that ``view`` takes the world's to."""
         return tuple(solid for _, solid in self._placed(view))
 
@@ -196,7 +196,7 @@ class _Solids:
         points = np.concatenate(ends) if ends else None
         return None if points is None else np.stack([points.min(axis=0), points.max(axis=0)])
 
-    def _placed(self, view: Pose) -> list[tuple[int, Placed]]:
+    def _placed(self, view: Pose) -> list[tuple[int, SolidView]]:
         """The frame that carries each solid, and the solid."""
         position, quaternion = self._source.links()
         if self._known[0] != self._source.version:
@@ -205,7 +205,7 @@ class _Solids:
             view @ Pose(tuple(p), tuple(q)) for p, q in zip(position, quaternion, strict=True)
         ]
         return [
-            (solid.frame, Placed(solid.shape, frames[solid.frame] @ solid.pose, solid.material))
+            (solid.frame, SolidView(solid.shape, frames[solid.frame] @ solid.pose, solid.material))
             for solid in self._known[1]
             if isinstance(solid.shape, Shape)
         ]
@@ -282,7 +282,7 @@ class Show(_Page):
         except SceneError:  # the first reading will raise it, too
             return None
 
-    def _around(self) -> tuple[Placed, ...]:
+    def _around(self) -> tuple[SolidView, ...]:
         """All solids of the simulator, the robot's own too, in the sensor frame at present."""
         if self._solids is None or isinstance(self._sensor, Simulator):
             return ()
@@ -353,12 +353,12 @@ class SkinShow(_Page):
             raise TypeError("this skin is attached to a robot; write read()")
         readings = skin.step(scene, poses, time=time)
         now = float(self._count) if time is None else time
-        around = tuple(Placed(body.shape, body.pose, body.material) for body in scene)
+        around = tuple(SolidView(body.shape, body.pose, body.material) for body in scene)
         self._show(now, readings, around)
         return readings
 
     def _show(
-        self, time: float, readings: Mapping[str, Reading], around: tuple[Placed, ...]
+        self, time: float, readings: Mapping[str, Reading], around: tuple[SolidView, ...]
     ) -> None:
         poses = self._skin.poses
         parts = {

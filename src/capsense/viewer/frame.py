@@ -16,7 +16,7 @@ from capsense.viewer.plane import Plane
 Array = NDArray[np.float64]
 
 
-class Placed(NamedTuple):
+class SolidView(NamedTuple):
     """A solid of a robot's simulator."""
 
     shape: Shape
@@ -51,7 +51,7 @@ class Frame:
     """Potentials at its points [V], shape (n, terminals)."""
     charges: Charges | None = None
     """On the bodies, where potentials were asked for."""
-    around: tuple[Placed, ...] = ()
+    around: tuple[SolidView, ...] = ()
     """All solids of the robot's simulator in the sensor frame, where there is one; drawn in place
     of the bodies. Of a skin, in the frame of the world."""
     skin: Mapping[str, SkinPart] = field(default_factory=dict)

@@ -29,7 +29,7 @@ from capsense.viewer.plane import Plane
 if TYPE_CHECKING:
     from viser import ViserServer
 
-    from capsense.viewer.frame import Frame, Placed
+    from capsense.viewer.frame import Frame, SolidView
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -91,7 +91,7 @@ class _Robot:
         self._scene = scene
         self._around: list[_Drawn] = []
 
-    def show_around(self, solids: Sequence[Placed]) -> None:
+    def show_around(self, solids: Sequence[SolidView]) -> None:
         """Put a robot's solids where they stand; those of other shapes are made anew."""
         same = len(solids) == len(self._around) and all(
             new.shape is old.shape and new.material == old.material
@@ -118,7 +118,7 @@ class _Robot:
             if drawn.handle.opacity != opacity:
                 drawn.handle.opacity = opacity
 
-    def _drawn(self, name: str, solid: Placed) -> _Drawn:
+    def _drawn(self, name: str, solid: SolidView) -> _Drawn:
         handle = self._solid(name, solid.shape, colour_of(solid.material), side="double")
         faces = faces_of_hull(solid.shape)
         return _Drawn(solid.shape, solid.material, handle, faces, solid.pose)
