@@ -93,7 +93,8 @@ def test_skin_touch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pads sense a fist before it touches, and how it presses; the example checks itself."""
     pytest.importorskip("pybullet", reason="PyBullet is not installed")
     monkeypatch.delenv("DISPLAY", raising=False)
-    module = example("skin_touch", monkeypatch)
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    module = importlib.import_module("skin_touch")
     monkeypatch.setattr(module, "READINGS", 36)
     monkeypatch.setattr(module, "FRAMES", 2)
     record = module.main(tmp_path)
