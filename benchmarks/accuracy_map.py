@@ -212,7 +212,7 @@ def plot(results: list[dict[str, Any]], path: Path) -> None:
             text = r["label"].removeprefix(method).strip()
             axes.annotate(text, (r["all"]["ms"], r["all"]["rms"]), (0, -14), fontsize=9,
                           textcoords="offset points", ha="center")  # fmt: skip
-    axes.set(xlabel="median step, one core [ms]", ylabel="error of the diagonal of ΔC [%]")
+    axes.set(xlabel="median step, one core [ms]", ylabel="error of self capacitances ΔC_ii [%]")
     axes.margins(0.15)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

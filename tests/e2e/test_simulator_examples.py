@@ -89,6 +89,20 @@ def test_skin_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert 5_000 < (tmp_path / name).stat().st_size < 400_000
 
 
+def test_skin_touch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pads sense a fist before it touches, and how it presses; the example checks itself."""
+    pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    module = importlib.import_module("skin_touch")
+    monkeypatch.setattr(module, "READINGS", 36)
+    monkeypatch.setattr(module, "FRAMES", 2)
+    record = module.main(tmp_path)
+    assert len(record.names) > 20
+    for name in ("skin_touch.png", "skin_touch.webp"):
+        assert 5_000 < (tmp_path / name).stat().st_size < 400_000
+
+
 def test_gripper(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Two fingers grasp a block by touch; the example checks itself and prints a table."""
     pytest.importorskip("mujoco", reason="MuJoCo is not installed")

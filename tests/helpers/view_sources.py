@@ -22,11 +22,11 @@ WAIT = 10.0
 class Stated:
     """What sources have in common; sample k has k + 1 farads in every entry."""
 
-    def __init__(self, title: str) -> None:
-        self.title, self.design = title, cs.load_design("patch")
+    def __init__(self, title: str, design: str = "patch") -> None:
+        self.title, self.design = title, cs.load_design(design)
         self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
         self.empty = self.reading(-1)
-        self.green = None
+        self.green, self.cover = None, self.design.cover
         self.closed = False
 
     def stage(self, server: Any) -> Any:

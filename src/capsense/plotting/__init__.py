@@ -245,8 +245,9 @@ def plot(
         excitation: With readings: the signals shown, ``"matrix"``, ``"self"`` or ``"mutual"``.
 
     Returns:
-        The figure. A run's shows signals relative to the empty scene and as changes in farads;
-        beside them the bodies' ways over the electrodes, from above and from the side.
+        The figure. A run's shows the changes of self and mutual capacitances from the empty scene
+        [F], and force and compression of a cover; beside them the bodies' ways over the electrodes,
+        from above and from the side.
 
     Raises:
         TypeError: ``what`` is something else.
@@ -303,23 +304,27 @@ def plot_run(run: Run, across: str = "time [s]") -> Figure:
     values = run.values
     families = _families(run, values)
     touched = run.design.cover is not None
-    columns = len(families) + touched
-    figure = Figure(figsize=(4.4 * columns + 4.4, 7.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
-    grid = figure.add_gridspec(2, columns + 1, width_ratios=[1.0] * columns + [0.95])
+    columns = 1 + touched
+    figure = Figure(figsize=(5.6 * columns + 4.4, 7.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    grid = figure.add_gridspec(2, columns + 1, width_ratios=[1.0] * columns + [0.75])
     peak = _strongest(values, run.levels)
     shared: Axes | None = None
-    for column, family in enumerate(families):
-        upper = figure.add_subplot(grid[0, column], sharex=shared)
-        shared = shared or upper
-        lower = figure.add_subplot(grid[1, column], sharex=shared)
-        _draw_family(family, np.array(run.times), peak, upper, lower)
-        dress(lower, across)
+    for row, family in enumerate(families):
+        place = grid[row, 0] if len(families) > 1 else grid[:, 0]
+        axes = figure.add_subplot(place, sharex=shared)
+        shared = shared or axes
+        _draw_family(family, np.array(run.times), peak, axes)
+    assert shared is not None
+    lowest = [axes]
     if touched:
-        upper, lower = (
-            figure.add_subplot(grid[row, columns - 1], sharex=shared) for row in range(2)
-        )
+        upper, lower = (figure.add_subplot(grid[row, 1], sharex=shared) for row in range(2))
         _draw_touch(run, peak, upper, lower)
-        dress(lower, across)
+        lowest.append(lower)
+    for below in lowest:
+        dress(below, across)
+        _draw_time(below, np.array(run.times))
+    for above in figure.axes:
+        above.tick_params(labelbottom=above in lowest)
     colours = [style_of(k)[0] for k in range(len(run.design.electrodes))]
     if run.channels[0].excitation is Excitation.MUTUAL:
         colours = [PLAIN_ELECTRODE] * len(colours)
@@ -355,7 +360,6 @@ def _draw_touch(run: Run, peak: int, upper: Axes, lower: Axes) -> None:
         alignment="left", title_fontproperties={"size": 10, "weight": "bold"}, **LEGEND,
     )  # fmt: skip
     dress(upper, y="force on the cover [N]")
-    upper.tick_params(labelbottom=False)
     dress(lower, y="compression of the cover [mm]")
 
 
@@ -365,11 +369,10 @@ def _families(run: Run, values: Array) -> list[_Family]:
     pairs = [k for k, c in enumerate(channels) if c.row != c.column]
     out = []
     if selves:
-        matrix = channels[selves[0]].excitation is Excitation.MATRIX
-        title = "diagonal of the matrix" if matrix else "self capacitance"
         styles = [style_of(channels[k].row) for k in selves]
         labels = [channels[k].label for k in selves]
-        out.append(_Family(title, labels, styles, values[:, selves], run.levels[selves]))
+        levels = run.levels[selves]
+        out.append(_Family("self capacitance", labels, styles, values[:, selves], levels))
     if pairs:
         # A pair's capacitance is positive, whatever the sign of its entry in the matrix.
         sign = -1.0 if channels[pairs[0]].excitation is Excitation.MATRIX else 1.0
@@ -394,24 +397,22 @@ def _strongest(values: Array, levels: Array) -> int:
     return int(ends[after - 1] + ends[after]) // 2
 
 
-def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: Axes) -> None:
+def _draw_family(family: _Family, times: Array, peak: int, axes: Axes) -> None:
+    """Draw the changes of one family of signals from the empty scene."""
     changes = family.values - family.levels
     factor, unit = unit_of(float(np.abs(changes).max(initial=0.0)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = np.where(family.levels != 0, family.values / family.levels, np.nan)
     marker = "o" if len(times) < 3 else ""
-    for axes, signals in ((upper, relative), (lower, factor * changes)):
-        for k in range(signals.shape[1] - 1, -1, -1):
-            colour, dash = family.styles[k]
-            strong = k < MAX_LINES or colour != FAINT
-            axes.plot(
-                times, signals[:, k], color=colour, ls=dash, marker=marker,
-                lw=1.6 if strong else 0.8, zorder=3 if strong else 2, label=family.labels[k],
-            )  # fmt: skip
-        if len(times) > 1:
-            axes.axvline(times[peak], color=INK, lw=0.7, ls=":", zorder=1)
-        axes.margins(x=0.01)
-    lines = upper.get_lines()[: len(family.labels)][::-1]
+    for k in range(changes.shape[1] - 1, -1, -1):
+        colour, dash = family.styles[k]
+        strong = k < MAX_LINES or colour != FAINT
+        axes.plot(
+            times, factor * changes[:, k], color=colour, ls=dash, marker=marker,
+            lw=1.6 if strong else 0.8, zorder=3 if strong else 2, label=family.labels[k],
+        )  # fmt: skip
+    if len(times) > 1:
+        axes.axvline(times[peak], color=INK, lw=0.7, ls=":", zorder=1)
+    axes.margins(x=0.01)
+    lines = axes.get_lines()[: len(family.labels)][::-1]
     entries = [
         (line, label)
         for line, label, style in zip(lines, family.labels, family.styles, strict=True)
@@ -420,18 +421,21 @@ def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: A
     rest = len(lines) - len(entries)
     if rest:
         entries.append((lines[-1], f"{rest} others"))
-    upper.legend(
+    axes.legend(
         *zip(*entries, strict=True), loc="lower left", bbox_to_anchor=(-0.02, 1.0),
         ncols=5 if len(entries) > 6 else 6, handlelength=1.4, columnspacing=0.8, title=family.title,
         alignment="left", title_fontproperties={"size": 10, "weight": "bold"}, **LEGEND,
     )  # fmt: skip
-    dress(upper, y="relative to the empty scene")
-    upper.tick_params(labelbottom=False)
-    dress(lower, y=f"change from the empty scene [{unit}]")
-    if len(times) > 1:  # colours of time along the bottom, as they are used for the way
-        low, high = lower.get_ylim()
-        height = 0.025 * (high - low)
-        place = (times[0], times[-1], low - height, low)
-        colours = np.linspace(0, 1, 256)[None]
-        lower.imshow(colours, cmap=TIME_COLOURS, aspect="auto", extent=place, zorder=0)
-        lower.set_ylim(low - height, high)
+    dress(axes, y=f"change from the empty scene [{unit}]")
+
+
+def _draw_time(axes: Axes, times: Array) -> None:
+    """Draw the colours of time along the bottom, as they are used for the bodies' ways."""
+    if len(times) < 2:
+        return
+    low, high = axes.get_ylim()
+    height = 0.025 * (high - low)
+    place = (times[0], times[-1], low - height, low)
+    colours = np.linspace(0, 1, 256)[None]
+    axes.imshow(colours, cmap=TIME_COLOURS, aspect="auto", extent=place, zorder=0)
+    axes.set_ylim(low - height, high)

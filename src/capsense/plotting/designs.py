@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 ELECTRODES = ("#d9822b", "#eab676")  # neighbours in matrix order differ
 ROLE_COLOURS = {Role.GROUND: "#8fa3ad", Role.SHIELD: "#7fb59a", Role.FLOATING: "#b59ac4"}
 LAYER_COLOUR = "#eef0e4"
+LEGEND_WIDTH = 100
+"""So many characters fit side by side into the figure of a design."""
 
 
 def draw_design(design: Design, ax: Axes | None = None) -> Axes:
@@ -156,7 +158,11 @@ def _top_view(design: Design, ax: Axes) -> None:
     ax.set_aspect("equal")
     dress(ax, "x [mm]", "y [mm]", design.name)
     below = ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=4, **LEGEND)
+    longest = max(len(str(label)) for label in ax.get_legend_handles_labels()[1])
+    columns = min(4, max(1, LEGEND_WIDTH // (longest + 6)))
+    ax.legend(
+        loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=columns, **LEGEND
+    )
 
 
 def _heights(design: Design) -> tuple[float, float]:
@@ -331,6 +337,8 @@ def _draw_truth(axes: Axes, time: Array, shown: dict[str, tuple[Array, str]]) ->
     for label, (change, colour) in shown.items():
         what = "fall, mutual" if colour == MUTUAL_COLOUR else "rise, self"
         axes.plot(time, change, color=colour, lw=1.6, label=f"{label} ({what})")
+    axes.plot([], [], color=FAINT, lw=1.4, label="true, in the other panels")
+    axes.plot([], [], color=INK, ls="", marker=".", ms=4, mew=0, label="reported by the chip")
     axes.legend(loc="lower center", **LEGEND)
     axes.set_title("true capacitance", **TITLES)
 

@@ -41,6 +41,8 @@ RANGES = ((0.01, 0.03), (0.03, 0.06), (0.06, 0.10), (0.10, 0.15))
 """Distances [m] between which slopes are taken."""
 NEAR = (0.001, 0.002, 0.003, 0.005, 0.007)
 """Distances below the ranges [m]; at zero a bare electrode would touch the skin."""
+DRAWN = (0.005, 0.15)
+"""Distances that are drawn [m]: gaps for which an accuracy is stated."""
 SIZES = (0.03, 0.06, 0.10)
 """Edges of the square electrodes [m]."""
 RADII = (0.025, 0.04, 0.055)
@@ -297,13 +299,15 @@ def plot_approach(
     for setup, found in cases.items():
         style = {"ls": _line(setup), "color": COLOURS[SIZES.index(setup.size)]}
         label = f"{setup.size * 1e3:.0f} mm, {setup.backing}"
-        code = counts(*found.readings())
-        axes[0].plot(1e2 * found.distance, np.where(code > 0, code, np.nan), label=label, **style)
-        axes[1].plot(1e2 * found.distance, 1e15 * found.change(), label=label, **style)
+        code, d = counts(*found.readings()), found.distance
+        shown = d > DRAWN[0] - 1e-9
+        axes[0].plot(1e2 * d[shown], np.where(code > 0, code, np.nan)[shown], label=label, **style)
+        axes[1].plot(1e2 * d[shown], 1e15 * found.change()[shown], label=label, **style)
     _groundings(axes[2], next(iter(cases.values())))
     for setup, found in boxes.items():
+        shown = found.distance > DRAWN[0] - 1e-9
         axes[3].plot(
-            1e2 * found.distance, 1e15 * found.change(tared=False), ls=_line(setup),
+            1e2 * found.distance[shown], 1e15 * found.change(tared=False)[shown], ls=_line(setup),
             color=COLOURS[BOXES.index(setup.box)], label=f"{setup.box:g} m, {setup.backing}",
         )  # fmt: skip
     titles = (
@@ -311,10 +315,10 @@ def plot_approach(
         "path to ground; 30 mm free", "box; 30 mm, limb away as tare",
     )  # fmt: skip
     for k, (axis, title) in enumerate(zip(axes, titles, strict=True)):
-        axis.set(xscale="log", yscale="log", xlim=(0.1, 15))
+        axis.set(xscale="log", yscale="log", xlim=(1e2 * DRAWN[0], 1e2 * DRAWN[1]))
         upwards = "change of capacitance [fF]" if k else "tared counts"
         dress(axis, "distance [cm]" if k > 1 else "", upwards, title)
-        axis.set_xticks([0.1, 0.3, 1, 3, 6, 15], labels=["0.1", "0.3", "1", "3", "6", "15"])
+        axis.set_xticks([0.5, 1, 3, 6, 15], labels=["0.5", "1", "3", "6", "15"])
         axis.minorticks_off()
         axis.legend(loc="lower left", **LEGEND)
     return figure
@@ -322,9 +326,10 @@ def plot_approach(
 
 def _groundings(axis: Axes, found: LimbCurves) -> None:
     """Limbs tied to ground in several ways; the hardware's fits, laid on the grounded one."""
-    z, change = found.distance, found.change()
+    shown = found.distance > DRAWN[0] - 1e-9
+    z, change = found.distance[shown], found.change()[shown]
     for name, colour in zip(GROUNDINGS, COLOURS, strict=False):
-        axis.plot(1e2 * z, 1e15 * found.change(MAIN, name), color=colour, label=name)
+        axis.plot(1e2 * z, 1e15 * found.change(MAIN, name)[shown], color=colour, label=name)
     meet = 0.03  # where the hardware's curves are laid on ours
     scale = float(np.interp(meet, z, change))
     for (name, (k, b)), line in zip(FITS.items(), (":", "--", "-."), strict=True):

@@ -45,6 +45,8 @@ from capsense.reproduce.scenario1_setup import (
 from capsense.simulator import Simulator
 
 MEASURED, PAPER, OURS = INK, COLOURS[1], COLOURS[0]
+WAYS = (COLOURS[2], PAPER, MEASURED)
+"""Colours of the boards' ways."""
 
 
 def plot_panels(panels: Mapping[str, tuple[Array, PaperCurves | None]]) -> Figure:
@@ -59,10 +61,11 @@ def plot_panels(panels: Mapping[str, tuple[Array, PaperCurves | None]]) -> Figur
         else:
             name += ", predicted"
         ax.plot(sample, ours, color=OURS, lw=1.6, label="CapSense")
-        ax.set_ylabel(f"C / C empty\n{name.replace('_', ', ')}", **LABELS)
+        ax.set_title(name.replace("_", ", "), **TITLES)
+        ax.set_ylabel("C / C empty", **LABELS)
         ax.set_xlim(0, len(ours) + 1)
         bare(ax)
-    axes[0].legend(loc="lower left", ncols=3, bbox_to_anchor=(0, 1), **LEGEND)
+    axes[0].legend(loc="lower right", ncols=3, bbox_to_anchor=(1, 1), **LEGEND)
     axes[-1].set_xlabel("sample", **LABELS)
     return figure
 
@@ -97,19 +100,15 @@ def plot_trajectories(
 
 
 def _draw_way(ax: Axes, setup: Scenario1Setup, boards: list[str], way: str) -> None:
-    """The middle of the bar's lower face on each distinct way, and the board, to scale."""
-    distinct: dict[bytes, list[str]] = {}
-    ways_of = {
-        name: 1e3 * np.array([p.position for p in setup.path(name, way, 1.0).waypoints])
-        for name in boards
-    }
-    for name, points in ways_of.items():
-        distinct.setdefault(points.tobytes(), []).append(name)
-    for names, colour in zip(distinct.values(), (OURS, PAPER, MEASURED), strict=False):
-        points = np.concatenate([ways_of[names[0]], ways_of[names[0]][:1]])
+    """The middle of the bar's lower face on its way over each board, and the board, to scale."""
+    for n, name in enumerate(boards):
+        corners = [p.position for p in setup.path(name, way, 1.0).waypoints]
+        points = 1e3 * np.array([*corners, corners[0]])
         height = points[:, 2] - 5e2 * setup.size[2]
-        label = ", ".join(names)
-        ax.plot(points[:, 0], height, color=colour, lw=1.0, marker="o", ms=2.5, label=label)
+        ax.plot(  # ways that are the same for two boards show both colours
+            points[:, 0], height, color=WAYS[n % len(WAYS)], ls=(2.5 * n, (5, 2.5 * n)), lw=1.2,
+            marker="o", ms=2.5, label=name,
+        )  # fmt: skip
     half = 5e2 * setup.size[0]
     x, z = points[0, 0], height[0]
     ax.plot([x - half, x + half], [z, z], color=FAINT, lw=3, solid_capstyle="butt")

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters import AttachedSensor, GeometrySensor, WorldSource
+from capsense.adapters import AttachedSensor, GeometrySensor
 from capsense.adapters.skin import AttachedSkin
 from capsense.adapters.world import Solid
 from capsense.errors import SceneError
-from capsense.reading import Reading, StepStats
+from capsense.reading import Reading, StepStats, Touch
 from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import DepthFrame, Pose, Scene, Shape
 from capsense.simulator import Simulator
 from capsense.skin import Skin
+from capsense.viewer.frame import SkinPart, SolidView
 from capsense.viewer.player import Follower
 from capsense.viewer.source import Frame, Stream
 
@@ -54,12 +55,20 @@ class SensorStream(_Fed):
     Args:
         simulator: Of the sensor; potentials come from a copy.
         where: Says where the sensor is, for the title.
+        robot: Corners of the box around the robot that carries it, in the sensor frame [m], shape
+            (2, 3); None where there is none.
     """
 
-    def __init__(self, simulator: Simulator, where: str) -> None:
+    def __init__(self, simulator: Simulator, where: str, robot: Array | None) -> None:
         super().__init__(simulator.copy())
+        self._robot = robot
         self.title, self.empty = self.design.name + where, simulator.empty
         self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
+
+    def stage(self, server: ViserServer) -> Any:
+        from capsense.viewer.scene_drawing import SceneDrawing
+
+        return SceneDrawing(server, self.design, robot=self._robot)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +81,8 @@ class SkinReading:
     """The changes [F], shape (s,)."""
     stats: StepStats
     """Of the worst sensor, and the time of all."""
-    touch: None = None
+    touch: Touch | None
+    """For each sensor the force on its cover, and the largest compression."""
 
     @property
     def delta(self) -> Array:
@@ -86,25 +96,37 @@ class SkinStream(_Fed):
     Args:
         simulators: Name → sensor.
         middles: Where they stand at first [m], shape (s, 3).
+        robot: As of :class:`SensorStream`, in the frame of the world.
     """
 
-    def __init__(self, simulators: Mapping[str, Simulator], middles: Array) -> None:
+    def __init__(
+        self, simulators: Mapping[str, Simulator], middles: Array, robot: Array | None
+    ) -> None:
         self._designs = {name: s.design for name, s in simulators.items()}
         super().__init__(next(iter(simulators.values())))
-        self.green, self._middles = None, middles
+        self.green, self._middles, self._robot = None, middles, robot
+        covers = [design.cover for design in self._designs.values() if design.cover is not None]
+        self.cover = max(covers, key=lambda cover: cover.limit, default=None)
         self.title = f"skin of {len(simulators)} sensors"
         self.channels = channels_of(Excitation.SELF, list(simulators))
-        self.empty = self.reading({name: np.zeros(1) for name in simulators}, StepStats(0.0, 0.0))
+        nothing = {name: SkinPart(Pose(), np.zeros(1), None) for name in simulators}
+        self.empty = self.reading(nothing, StepStats(0.0, 0.0))
 
-    def reading(self, changes: Mapping[str, Array], stats: StepStats) -> Reading:
-        """What charts show of changes of electrodes' own capacitances [F]."""
-        largest = np.array([np.abs(own).max() for own in changes.values()])
-        return cast("Reading", SkinReading(tuple(changes), largest, stats))
+    def reading(self, parts: Mapping[str, SkinPart], stats: StepStats) -> Reading:
+        """What charts and tables show of the sensors."""
+        largest = np.array([np.abs(part.changes).max() for part in parts.values()])
+        touch = None
+        if self.cover is not None:
+            touched = [part.touch for part in parts.values()]
+            force = np.array([0.0 if t is None else t.total for t in touched])
+            depth = np.array([0.0 if t is None else t.compression.max() for t in touched])
+            touch = Touch(force, depth, float(force.sum()))
+        return cast("Reading", SkinReading(tuple(parts), largest, stats, touch))
 
     def stage(self, server: ViserServer) -> Any:
         from capsense.viewer.scene_drawing import SkinDrawing
 
-        return SkinDrawing(server, self._designs, self._middles)
+        return SkinDrawing(server, self._designs, self._middles, self._robot)
 
 
 class _Page:
@@ -152,26 +174,41 @@ class _Solids:
     """All solids of a robot's simulator.
 
     Args:
-        source: Where they come from.
+        sensors: Those on the robot; they share one source of their world.
     """
 
-    def __init__(self, source: WorldSource) -> None:
-        self._source = source
+    def __init__(self, sensors: Collection[GeometrySensor]) -> None:
+        self._carriers = {sensor._carrier for sensor in sensors}
+        self._source = next(iter(sensors)).source
         self._known: tuple[int, list[Solid]] = (-1, [])
 
-    def now(self, view: Pose) -> tuple[tuple[Shape, Pose], ...]:
+    def now(self, view: Pose) -> tuple[SolidView, ...]:
         """The solids at present, in the frame that ``view`` takes the world's to."""
+        return tuple(solid for _, solid in self._placed(view))
+
+    def robot(self, view: Pose) -> Array | None:
+        """Corners of the box around the robot [m], shape (2, 3); None where it has no solids."""
+        own = set().union(*(self._source.robot(frame) for frame in self._carriers))
+        ends = []
+        for frame, (shape, pose, _) in self._placed(view):
+            if frame in own:
+                ends.append(pose.apply(shape.to_trimesh().vertices))
+        points = np.concatenate(ends) if ends else None
+        return None if points is None else np.stack([points.min(axis=0), points.max(axis=0)])
+
+    def _placed(self, view: Pose) -> list[tuple[int, SolidView]]:
+        """The frame that carries each solid, and the solid."""
         position, quaternion = self._source.links()
         if self._known[0] != self._source.version:
             self._known = self._source.version, self._source.solids(None)
         frames = [
             view @ Pose(tuple(p), tuple(q)) for p, q in zip(position, quaternion, strict=True)
         ]
-        return tuple(
-            (solid.shape, frames[solid.frame] @ solid.pose)
+        return [
+            (solid.frame, SolidView(solid.shape, frames[solid.frame] @ solid.pose, solid.material))
             for solid in self._known[1]
             if isinstance(solid.shape, Shape)
-        )
+        ]
 
 
 class Show(_Page):
@@ -184,12 +221,11 @@ class Show(_Page):
                 "attach returned, or watch a scenario or a recording with capsense view"
             )
         self._sensor = sensor
-        self._stream = (
-            SensorStream(sensor, "")
-            if isinstance(sensor, Simulator)
-            else SensorStream(sensor.simulator, ", on a robot")
-        )
-        self._solids = _Solids(sensor.source) if isinstance(sensor, GeometrySensor) else None
+        self._solids = _Solids([sensor]) if isinstance(sensor, GeometrySensor) else None
+        if isinstance(sensor, Simulator):
+            self._stream = SensorStream(sensor, "", None)
+        else:
+            self._stream = SensorStream(sensor.simulator, ", on a robot", self._robot(sensor))
         super().__init__(self._stream, host, port)
 
     def step(self, scene: Scene | DepthFrame, *, time: float | None = None) -> Reading:
@@ -239,7 +275,14 @@ class Show(_Page):
         self._stream.frames.put(frame)
         self._count += 1
 
-    def _around(self) -> tuple[tuple[Shape, Pose], ...]:
+    def _robot(self, sensor: AttachedSensor) -> Array | None:
+        """Corners of the box around the robot in the sensor frame [m], where it is known."""
+        try:
+            return None if self._solids is None else self._solids.robot(sensor.pose.inverse())
+        except SceneError:  # the first reading will raise it, too
+            return None
+
+    def _around(self) -> tuple[SolidView, ...]:
         """All solids of the simulator, the robot's own too, in the sensor frame at present."""
         if self._solids is None or isinstance(self._sensor, Simulator):
             return ()
@@ -255,12 +298,13 @@ class SkinShow(_Page):
             simulators, self._solids = skin.simulators, None
         else:
             simulators = {name: sensor.simulator for name, sensor in skin.sensors.items()}
-            self._solids = _Solids(next(iter(skin.sensors.values())).source)
+            self._solids = _Solids(skin.sensors.values())
         try:
             places = [pose.position for pose in skin.poses.values()]
+            robot = None if self._solids is None else self._solids.robot(Pose())
         except SceneError:  # the first reading will raise it, too
-            places = [(0.0, 0.0, 0.0)]
-        self._stream = SkinStream(simulators, np.array(places))
+            places, robot = [(0.0, 0.0, 0.0)], None
+        self._stream = SkinStream(simulators, np.array(places), robot)
         super().__init__(self._stream, host, port)
 
     def read(self, time: float | None = None) -> dict[str, Reading]:
@@ -309,25 +353,24 @@ class SkinShow(_Page):
             raise TypeError("this skin is attached to a robot; write read()")
         readings = skin.step(scene, poses, time=time)
         now = float(self._count) if time is None else time
-        self._show(now, readings, tuple((body.shape, body.pose) for body in scene))
+        around = tuple(SolidView(body.shape, body.pose, body.material) for body in scene)
+        self._show(now, readings, around)
         return readings
 
     def _show(
-        self,
-        time: float,
-        readings: Mapping[str, Reading],
-        around: tuple[tuple[Shape, Pose], ...],
+        self, time: float, readings: Mapping[str, Reading], around: tuple[SolidView, ...]
     ) -> None:
-        own = {name: np.abs(np.diag(r.delta)) for name, r in readings.items()}
+        poses = self._skin.poses
+        parts = {
+            name: SkinPart(poses[name], np.abs(np.diag(r.delta)), r.touch)
+            for name, r in readings.items()
+        }
         stats = StepStats(
             max(r.stats.solver_error for r in readings.values()),
             sum(r.stats.wall_time for r in readings.values()),
         )
-        poses = self._skin.poses
-        frame = Frame(
-            self._count, time, Scene(), self._stream.reading(own, stats), around=around,
-            skin={name: (poses[name], own[name]) for name in own},
-        )  # fmt: skip
+        reading = self._stream.reading(parts, stats)
+        frame = Frame(self._count, time, Scene(), reading, around=around, skin=parts)
         self._stream.frames.put(frame)
         self._count += 1
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from capsense._style import COLOURS
 from capsense.reading import Touch
 from capsense.scenario import Channel
+from capsense.viewer.appearance import CHARGE_DECADES, charge_colours
 from capsense.viewer.plane import AXES, OCTAVES, Plane, palette, region
 from capsense.viewer.player import Playback
 
@@ -32,8 +33,15 @@ MAX_NUMBERS = 10
 FEMTO = 1e15
 
 
+STYLE = "<style>.uplot, .uplot .u-wrap { min-width: 100% }</style>"
+"""Charts are as wide as their part of the page before they have measured that."""
+
+
 class Chart:
     """The strongest of some channels against time, as changes in femtofarads.
+
+    The chart itself stays; where there are more channels than lines, the lines are handed over to
+    channels that become stronger, and a legend above tells which they show.
 
     Args:
         gui: Where it is drawn, together with ``tab``.
@@ -47,40 +55,66 @@ class Chart:
         self, gui: GuiApi, tab: GuiTabHandle, title: str, columns: Sequence[int],
         labels: Sequence[str],
     ) -> None:  # fmt: skip
-        self._gui, self._tab, self._title = gui, tab, title
         self._columns, self._labels = np.array(columns), labels
         self._peaks = np.zeros(len(columns))
         self._drawn = np.arange(min(MAX_LINES, len(columns)))
-        self._handle = self._draw((np.array([0.0, 1.0]), *np.zeros((len(self._drawn), 2))))
+        every = len(self._drawn) == len(columns)
+        lines = [
+            {"label": labels[n] if every else f"{n + 1}", "stroke": COLOURS[n], "width": 1.6}
+            for n in range(len(self._drawn))
+        ]
+        series: Any = ({"label": "s"}, *lines)
+        with tab:
+            self._legend = None if every else gui.add_html("")
+            self._handle: GuiUplotHandle = gui.add_uplot(
+                (np.array([0.0, 1.0]), *np.zeros((len(self._drawn), 2))), series, title=title,
+                height=190, scales={"x": {"time": False}, "y": {"auto": True}},
+                axes=({"label": "s", "labelSize": 16, "size": 28}, {"size": 52}),
+                legend={"show": every, "live": False},
+            )  # fmt: skip
+        self._name_lines()
 
     def show(self, times: Array, changes: Array) -> None:
         """Draw samples, as :func:`strip` gives them: times [s], changes of all channels [F]."""
         values = changes[:, self._columns]
         self._peaks = np.maximum(self._peaks, np.abs(values).max(axis=0))
-        drawn = np.sort(np.argsort(-self._peaks, kind="stable")[: len(self._drawn)])
+        drawn = handed_over(self._drawn, self._peaks)
+        if not np.array_equal(drawn, self._drawn):
+            self._drawn = drawn
+            self._name_lines()
         lines = np.ascontiguousarray(FEMTO * values[:, drawn].T)
-        data = (np.ascontiguousarray(times), *lines)
-        if np.array_equal(drawn, self._drawn):
-            self._handle.data = data
-            return
-        # A chart whose lines are exchanged in place loses its axis of time, so it is made anew.
-        self._drawn, old = drawn, self._handle
-        self._handle = self._draw(data, old.order)
-        old.remove()
+        self._handle.data = (np.ascontiguousarray(times), *lines)
 
-    def _draw(self, data: tuple[Array, ...], order: float | None = None) -> GuiUplotHandle:
-        lines = [
-            {"label": self._labels[int(k)], "stroke": COLOURS[n % len(COLOURS)], "width": 1.6}
-            for n, k in enumerate(self._drawn)
-        ]
-        series: Any = ({"label": "s"}, *lines)
-        with self._tab:
-            return self._gui.add_uplot(
-                data, series, title=self._title, height=190, order=order,
-                scales={"x": {"time": False}, "y": {"auto": True}},
-                axes=({"label": "s", "labelSize": 16, "size": 28}, {"size": 52}),
-                legend={"show": True, "live": False},
-            )  # fmt: skip
+    def _name_lines(self) -> None:
+        if self._legend is not None:
+            self._legend.content = line_legend([self._labels[int(k)] for k in self._drawn])
+
+
+def handed_over(drawn: NDArray[np.intp], peaks: Array) -> NDArray[np.intp]:
+    """Which channels lines show: the strongest, each of them with the line that it has already.
+
+    Args:
+        drawn: The channels shown so far, shape (n,).
+        peaks: Largest change of each channel, shape (k,).
+    """
+    strongest = np.argsort(-peaks, kind="stable")[: len(drawn)]
+    out = drawn.copy()
+    out[~np.isin(drawn, strongest)] = strongest[~np.isin(strongest, drawn)]
+    return out
+
+
+def line_legend(labels: Sequence[str]) -> str:
+    """Names of a chart's lines in their colours, as HTML."""
+    marks = "".join(
+        f'<span style="white-space:nowrap;margin-right:0.8em"><span style="color:{colour}">&#9632;'
+        f"</span> {html.escape(label)}</span>"
+        for label, colour in zip(labels, COLOURS, strict=False)
+    )
+    return (
+        '<div class="lines" style="padding:0.3em 0.8em 0;font-size:11px;display:flex;'
+        'flex-wrap:wrap;justify-content:center">'
+        f"{marks}</div>"
+    )
 
 
 def make_charts(gui: GuiApi, tab: GuiTabHandle, channels: Sequence[Channel]) -> list[Chart]:
@@ -156,7 +190,7 @@ def touch_table(names: Sequence[str], touch: Touch, limit: float) -> str:
     style = "width:100%;border-collapse:collapse;font-size:11px;text-align:right;line-height:1.7"
     return (
         '<div style="padding:0 0.6em 0.6em"><div style="font-size:13px;text-align:center">'
-        f"touch: force and compression, {touch.total:.3g} N in total</div>"
+        f"touch: force (arrows) and compression, {touch.total:.3g} N in total</div>"
         f'<table class="touch" style="{style}">{"".join(rows)}</table></div>'
     )
 
@@ -183,7 +217,7 @@ class PlaneControls:
         first = int(np.argmin(np.linalg.norm(self._centres - middle, axis=1).round(3)))
         with gui.add_folder("potential"):
             self._on = gui.add_checkbox("shown", True)
-            self._charge = gui.add_checkbox("charge on the bodies", True)
+            self._charge = None if player.live else gui.add_checkbox("charge on the bodies", True)
             self._driven = gui.add_dropdown("1 V at", self._names, initial_value=self._names[first])
             self._across = gui.add_dropdown("plane across", AXES, initial_value="y")
             self._at: list[Any] = [
@@ -192,7 +226,7 @@ class PlaneControls:
                     AXES, np.round(1e3 * self._region, 1).tolist(), self._places(), strict=True
                 )
             ]
-            gui.add_html(legend())
+            gui.add_html(legend() if player.live else legend() + charge_legend())
         self._lay()
         self._on.on_update(self._ask)
         self._driven.on_update(self._centre)
@@ -208,7 +242,7 @@ class PlaneControls:
     @property
     def charge(self) -> bool:
         """Whether charges are wanted, too."""
-        return bool(self._charge.value and self._on.value)
+        return bool(self._charge is not None and self._charge.value and self._on.value)
 
     @property
     def plane(self) -> Plane | None:
@@ -251,4 +285,18 @@ def legend() -> str:
         '<div style="padding:0 0.8em 0.6em;font-size:12px"><table style="width:100%;'
         f'border-spacing:0;line-height:0.8"><tr>{cells}</tr></table><span style="float:right">1 V'
         f"</span>{1e3 * 2.0**-OCTAVES:.0f} mV, doubling from line to second next</div>"
+    )
+
+
+def charge_legend() -> str:
+    """The colours of charges on the bodies, as HTML."""
+    shares = np.linspace(0.0, 1.0, 16)
+    cells = "".join(
+        f'<td style="background:rgb({r},{g},{b})">&nbsp;</td>'
+        for r, g, b in charge_colours(shares).tolist()
+    )
+    return (
+        '<div class="charges" style="padding:0 0.8em 0.6em;font-size:12px"><table style="width:'
+        f'100%;border-spacing:0;line-height:0.8"><tr>{cells}</tr></table><span style="float:right">'
+        f"the densest</span>charge: {10.0**-CHARGE_DECADES:g} of</div>"
     )

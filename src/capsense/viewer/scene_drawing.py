@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,33 +14,45 @@ from capsense._style import signal_colours
 from capsense.design import Design
 from capsense.design.geometry import Surface
 from capsense.plotting.designs import ROLE_COLOURS
-from capsense.reading import Charges
-from capsense.scene import Body, Layers, Pose, Scene, Shape, ShapeKind
+from capsense.reading import Charges, Touch
+from capsense.scene import Body, Layers, Material, Pose, Scene, Shape, ShapeKind
+from capsense.viewer.appearance import (
+    CHARGE_DECADES,
+    SEEN_THROUGH,
+    blocks,
+    charge_colours,
+    colour_of,
+    faces_of_hull,
+)
 from capsense.viewer.plane import Plane
 
 if TYPE_CHECKING:
     from viser import ViserServer
 
-    from capsense.viewer.frame import Frame
+    from capsense.viewer.frame import Frame, SolidView
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 LAYER: Colour = (206, 212, 178)
-CONDUCTIVE: Colour = (120, 134, 150)
-DIELECTRIC: Colour = (150, 190, 205)
 SHRUNK = 3e-4
 """So much [m] is taken off the faces of layers, so that sheets on them are in front of them."""
 MAX_LABELS = 32
 """A design of more electrodes shows no names."""
 SHADES = 31
 """Colours of an electrode beyond that of no signal."""
+APART = 1000.0
+"""Distance of an electrode's coloured copies [m]; see :func:`copies`."""
+FAR = 20.0
+"""What is further away than this is not drawn [m]."""
 AXES = 0.03
 """Length of the axes that are drawn [m]."""
-CHARGE_DECADES = 3.0
-"""Charges down to ten to the minus this of the densest are shown."""
 SPOTS, DOT = 6000, 1.2e-3
 """So many dots a body shows its charge with, and their radius [m]."""
+PRESSED: Colour = (0, 114, 178)
+"""Of the arrows of forces."""
+ARROW = 0.03
+"""Length of the arrow of the largest force so far [m]."""
 _FACETED = (ShapeKind.BOX, ShapeKind.CYLINDER, ShapeKind.MESH)
 
 
@@ -54,6 +67,19 @@ class _Below:
         return lambda name, *args, **options: call(self._root + name, *args, **options)
 
 
+@dataclass(eq=False)
+class _Drawn:
+    """A solid that is drawn."""
+
+    shape: Shape
+    material: Material
+    handle: Any
+    faces: Array
+    """Of its convex hull, as :func:`faces_of_hull` gives them."""
+    pose: Pose
+    """Where it was put last."""
+
+
 class _Robot:
     """Draws the solids of a robot's simulator.
 
@@ -63,19 +89,39 @@ class _Robot:
 
     def __init__(self, scene: Any) -> None:
         self._scene = scene
-        self._around: list[tuple[Shape, Any]] = []
+        self._around: list[_Drawn] = []
 
-    def show_around(self, solids: Sequence[tuple[Shape, Pose]]) -> None:
+    def show_around(self, solids: Sequence[SolidView]) -> None:
         """Put a robot's solids where they stand; those of other shapes are made anew."""
-        if [id(shape) for shape, _ in solids] != [id(shape) for shape, _ in self._around]:
-            for _, handle in self._around:
-                handle.remove()
-            self._around = [
-                (shape, self._solid(f"/robot/{k}", shape, CONDUCTIVE, side="double"))
-                for k, (shape, _) in enumerate(solids)
-            ]
-        for (_, pose), (_, handle) in zip(solids, self._around, strict=True):
-            _put(handle, pose)
+        same = len(solids) == len(self._around) and all(
+            new.shape is old.shape and new.material == old.material
+            for new, old in zip(solids, self._around, strict=True)
+        )
+        if not same:
+            for old in self._around:
+                old.handle.remove()
+            self._around = [self._drawn(f"/robot/{k}", solid) for k, solid in enumerate(solids)]
+        for solid, drawn in zip(solids, self._around, strict=True):
+            drawn.pose = solid.pose
+            _put(drawn.handle, solid.pose)
+
+    def see_through(self, sights: Sequence[tuple[Array, Array]]) -> None:
+        """Let the solids be transparent that hide something.
+
+        Args:
+            sights: Where eyes are [m], shape (3,), and what each looks at [m], shape (n, 3).
+        """
+        for drawn in self._around:
+            away = drawn.pose.inverse()
+            hides = any(blocks(drawn.faces, away.apply(eye), away.apply(p)) for eye, p in sights)
+            opacity = SEEN_THROUGH if hides else None
+            if drawn.handle.opacity != opacity:
+                drawn.handle.opacity = opacity
+
+    def _drawn(self, name: str, solid: SolidView) -> _Drawn:
+        handle = self._solid(name, solid.shape, colour_of(solid.material), side="double")
+        faces = faces_of_hull(solid.shape)
+        return _Drawn(solid.shape, solid.material, handle, faces, solid.pose)
 
     def _solid(self, name: str, shape: Shape, colour: Colour, **options: Any) -> Any:
         mesh = shape.to_trimesh()
@@ -96,18 +142,29 @@ class SceneDrawing(_Robot):
         design: The sensor.
         root: The frame of the sensor, where it is one of several: it is drawn without its domain,
             names and scales.
+        robot: Corners of the box around the robot that carries the sensor [m], shape (2, 3); the
+            camera frames it.
     """
 
-    def __init__(self, server: ViserServer, design: Design, root: str = "") -> None:
+    def __init__(
+        self, server: ViserServer, design: Design, root: str = "", robot: Array | None = None
+    ) -> None:
         super().__init__(_Below(server.scene, root) if root else server.scene)
         self._bodies: list[tuple[Any, ...]] = []
         self._spots: list[Array] = []
-        self._shades = np.full(len(design.electrodes), -1)
-        self._plates: dict[tuple[int, int], Any] = {}
-        self._surfaces = [e.surface for e in design.electrodes]
+        self._shades = np.zeros(len(design.electrodes), dtype=int)
+        self._middles = np.array([e.surface.bounds.mean(axis=0) for e in design.electrodes])
+        self._normals = np.array([_normal(e.surface) for e in design.electrodes])
+        self._arrows: Any = None
+        self._largest_force = 0.0
         server.scene.configure_default_lights(cast_shadow=False)
         self._draw_stack(design)
-        self.show_signals(np.zeros(len(design.electrodes)))
+        self._plates = [
+            self._scene.add_glb(
+                f"/electrodes/{k}", copies(e.surface.triangles.reshape(-1, 3)), cast_shadow=False,
+                receive_shadow=False,
+            ) for k, e in enumerate(design.electrodes)
+        ]  # fmt: skip
         if root:
             return
         self._draw_domain(design)
@@ -118,7 +175,10 @@ class SceneDrawing(_Robot):
         low, high = np.array([e.surface.bounds for e in design.electrodes]).transpose(1, 0, 2)
         middle = (low.min(axis=0) + high.max(axis=0)) / 2
         reach = max(0.08, float(np.ptp([low.min(axis=0), high.max(axis=0)], axis=0).max()))
-        _look_at(server, middle, reach)
+        self.views = {"sensor": _view(middle + np.array([0.0, 0.0, 0.4 * reach]), 3.7 * reach)}
+        if robot is not None:
+            self.views["robot"] = _view_of(robot, self._middles)
+        _look_at(server, self.views)
 
     def show(self, frame: Frame, loudest: float) -> None:
         """Put bodies and the robot where they stand, and colour the electrodes.
@@ -130,27 +190,44 @@ class SceneDrawing(_Robot):
         self.show_bodies(Scene() if frame.around else frame.scene)
         self.show_around(frame.around)
         self.show_signals(np.abs(np.diag(frame.reading.delta)) / loudest)
+        self.show_touch(frame.reading.touch)
+
+    def reveal(self, eyes: Array) -> None:
+        """Let solids be transparent that hide electrodes from eyes [m], shape (e, 3)."""
+        self.see_through([(eye, self._middles) for eye in eyes])
 
     def show_signals(self, strength: Array) -> None:
         """Colour the electrodes by their signals, 0 to 1, shape (M,)."""
         shades = np.rint(SHADES * np.clip(strength, 0.0, 1.0)).astype(int)
         for k in np.flatnonzero(shades != self._shades).tolist():
-            old = self._plates.get((k, int(self._shades[k])))
-            self._plate(k, int(shades[k])).visible = True
-            if old is not None:
-                old.visible = False
+            self._plates[k].position = (0.0, 0.0, -APART * float(shades[k]))
         self._shades = shades
 
-    def _plate(self, number: int, shade: int) -> Any:
-        """An electrode in one of its colours, whatever the light; made once, then kept."""
-        if (number, shade) not in self._plates:
-            corners = self._surfaces[number].triangles.reshape(-1, 3)
-            colour = signal_colours([shade / SHADES])[0]
-            self._plates[number, shade] = self._scene.add_glb(
-                f"/electrodes/{number}-{shade}", unlit(corners, colour), cast_shadow=False,
-                receive_shadow=False,
-            )  # fmt: skip
-        return self._plates[number, shade]
+    def show_touch(self, touch: Touch | None, largest: float | None = None) -> None:
+        """Draw an arrow onto each electrode whose cover carries a force, as long as that is large.
+
+        Args:
+            touch: What is pressed, if there is a cover.
+            largest: The force of the longest arrow [N]; that of this sensor so far by default.
+        """
+        force = np.zeros(0) if touch is None else touch.force
+        if largest is None:
+            largest = self._largest_force = max(self._largest_force, force.max(initial=0.0))
+        pressed = np.flatnonzero(force > 0.0)
+        if not len(pressed):
+            if self._arrows is not None:
+                self._arrows.visible = False
+            return
+        tips = self._middles[pressed]
+        length = ARROW * force[pressed] / largest
+        tails = tips + length[:, None] * self._normals[pressed]
+        points = np.stack([tails, tips], axis=1).astype(np.float32)
+        if self._arrows is None:
+            self._arrows = self._scene.add_arrows(
+                "/touch", points, PRESSED, shaft_radius=1.2e-3, head_radius=3e-3, head_length=6e-3
+            )
+        self._arrows.points = points
+        self._arrows.visible = True
 
     def show_bodies(self, scene: Scene) -> None:
         """Put the bodies where they stand; those of other shapes are made anew."""
@@ -212,28 +289,30 @@ class SceneDrawing(_Robot):
 
     def _draw_stack(self, design: Design) -> None:
         for k, layer in enumerate(design.layers):
+            opacity = SEEN_THROUGH if _covers(layer.surface, design) else None
             if layer.facets:
-                self._sheet(f"/layers/{k}", layer.surface, LAYER)
+                self._sheet(f"/layers/{k}", layer.surface, LAYER, opacity)
                 continue
             less = min(SHRUNK, 0.2 * float(layer.upper[2] - layer.lower[2]))
             size = layer.upper - layer.lower - [0.0, 0.0, 2 * less]
             self._scene.add_box(
                 f"/layers/{k}", color=LAYER, dimensions=tuple(size),
-                position=(layer.lower + layer.upper) / 2, cast_shadow=False,
+                position=(layer.lower + layer.upper) / 2, cast_shadow=False, opacity=opacity,
             )  # fmt: skip
         for k, conductor in enumerate(design.conductors):
             colour = bytes.fromhex(ROLE_COLOURS[conductor.role].removeprefix("#"))
-            self._sheet(f"/conductors/{k}", conductor.surface, tuple(colour))
+            opacity = SEEN_THROUGH if _covers(conductor.surface, design) else None
+            self._sheet(f"/conductors/{k}", conductor.surface, tuple(colour), opacity)
 
-    def _sheet(self, name: str, surface: Surface, colour: Any) -> None:
+    def _sheet(self, name: str, surface: Surface, colour: Any, opacity: float | None) -> None:
         corners = surface.triangles.reshape(-1, 3)
         faces = np.arange(len(corners)).reshape(-1, 3)
-        self._mesh(name, corners, faces, colour, flat_shading=True, side="double")
+        self._mesh(name, corners, faces, colour, flat_shading=True, side="double", opacity=opacity)
 
     def _named(self, number: int, body: Body, label: str | None) -> tuple[Any, ...]:
         """A body, what is drawn of it, and its label, if it has one."""
         name, shape = f"/bodies/{number}", body.shape
-        colour = CONDUCTIVE if body.material.is_conductor() else DIELECTRIC
+        colour = colour_of(body.material)
         if isinstance(shape, Layers):
             drawn = self._dots(name, shape, colour)
         else:
@@ -299,9 +378,14 @@ class SkinDrawing:
         server: Shows it to all who are connected.
         designs: Name → sensor.
         middles: Where they stand at first [m], shape (s, 3).
+        robot: Corners of the box around the robot that carries them [m], shape (2, 3), if there is
+            one; the camera frames it.
     """
 
-    def __init__(self, server: ViserServer, designs: Mapping[str, Design], middles: Array) -> None:
+    def __init__(
+        self, server: ViserServer, designs: Mapping[str, Design], middles: Array,
+        robot: Array | None = None,
+    ) -> None:  # fmt: skip
         self._frames = {
             name: server.scene.add_frame(f"/skin/{k}", show_axes=False)
             for k, name in enumerate(designs)
@@ -310,8 +394,14 @@ class SkinDrawing:
             SceneDrawing(server, design, f"/skin/{k}") for k, design in enumerate(designs.values())
         ]
         self._robot = _Robot(server.scene)
-        low, high = middles.min(axis=0), middles.max(axis=0)
-        _look_at(server, 0.5 * (low + high), max(0.15, 0.6 * float(np.linalg.norm(high - low))))
+        self._largest_force = 0.0
+        self._places, self._outwards = middles, np.zeros_like(middles)
+        around = max(0.15, 0.3 * float(np.linalg.norm(np.ptp(middles, axis=0))))
+        box = np.stack([middles.min(axis=0) - around, middles.max(axis=0) + around])
+        self.views = {"skin": _view_of(box, middles)}
+        if robot is not None:
+            self.views["robot"] = _view_of(robot, middles)
+        _look_at(server, self.views)
 
     def show(self, frame: Frame, loudest: float) -> None:
         """Put the sensors and the robot where they stand, and colour the electrodes.
@@ -321,18 +411,67 @@ class SkinDrawing:
             loudest: Change of an electrode that colours it fully [F].
         """
         self._robot.show_around(frame.around)
-        for part, (name, (pose, changes)) in zip(self._parts, frame.skin.items(), strict=True):
-            _put(self._frames[name], pose)
-            part.show_signals(changes / loudest)
+        forces = [part.touch.force.max() for part in frame.skin.values() if part.touch is not None]
+        self._largest_force = max(self._largest_force, *forces, 0.0, 0.0)
+        for drawing, (name, part) in zip(self._parts, frame.skin.items(), strict=True):
+            _put(self._frames[name], part.pose)
+            drawing.show_signals(part.changes / loudest)
+            drawing.show_touch(part.touch, self._largest_force)
+        poses = [part.pose for part in frame.skin.values()]
+        self._places = np.array([pose.position for pose in poses])
+        self._outwards = np.array([pose.rotation[:, 2] for pose in poses])
+
+    def reveal(self, eyes: Array) -> None:
+        """Let solids be transparent that hide sensors which face eyes [m], shape (e, 3)."""
+        sights = []
+        for eye in eyes:
+            facing = ((eye - self._places) * self._outwards).sum(axis=1) > 0.0
+            sights.append((eye, self._places[facing]))
+        self._robot.see_through(sights)
 
 
-def _look_at(server: ViserServer, middle: Array, reach: float) -> None:
-    """Let those who come look at a place [m] with so much around it [m]."""
+View = tuple[Array, Array]
+"""Where a camera is, and what it looks at [m], shape (3,) each."""
+FIELD_OF_VIEW = 0.8
+"""Height of the picture [rad]."""
+
+
+def _view(middle: Array, distance: float) -> View:
+    """From the front, the right and above, at a distance [m]."""
+    towards = np.array([1.3, -3.0, 1.7])
+    return middle + distance * towards / np.linalg.norm(towards), middle
+
+
+def _view_of(box: Array, points: Array) -> View:
+    """One that holds a box and some points [m], shapes (2, 3) and (n, 3)."""
+    ends = np.concatenate([box, points])
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    radius = 0.5 * float(np.linalg.norm(high - low))
+    return _view(0.5 * (low + high), radius / np.sin(0.5 * FIELD_OF_VIEW))
+
+
+def _look_at(server: ViserServer, views: Mapping[str, View]) -> None:
+    """Give those who come the last of some views."""
     camera = server.initial_camera
-    camera.near, camera.far = 1e-3, 20.0
-    camera.look_at = middle + np.array([0.0, 0.0, 0.4 * reach])
-    camera.position = middle + reach * np.array([1.3, -3.0, 1.7])
-    camera.fov = 0.8
+    camera.near, camera.far, camera.fov = 1e-3, FAR, FIELD_OF_VIEW
+    camera.position, camera.look_at = list(views.values())[-1]
+
+
+def _covers(surface: Surface, design: Design) -> bool:
+    """Whether some of a layer or a sheet is in front of an electrode."""
+    low, high = surface.bounds
+    return any(
+        low[2] >= e.surface.bounds[1, 2] and (low[:2] < e.surface.bounds[1, :2]).all()
+        and (high[:2] > e.surface.bounds[0, :2]).all()
+        for e in design.electrodes
+    )  # fmt: skip
+
+
+def _normal(surface: Surface) -> Array:
+    """Mean unit normal of a surface, shape (3,)."""
+    total = sum(np.asarray(f.axes[2]) * f.polygon.area for f in surface.facets)
+    length = float(np.linalg.norm(total))
+    return total / length if length > 0 else np.array([0.0, 0.0, 1.0])
 
 
 def _put(handle: Any, pose: Pose) -> None:
@@ -351,19 +490,15 @@ def spots_of(body: Body) -> Array:
     return np.asarray(points)
 
 
-def charge_colours(share: Array) -> NDArray[np.uint8]:
-    """Red, green and blue of charges, from none, 0, to the densest, 1, shape (n, 3)."""
-    from matplotlib import colormaps
+def copies(corners: Array) -> bytes:
+    """Triangles in each of the colours of a signal, whatever the light, as one glTF file.
 
-    return colormaps["RdPu"](0.15 + 0.85 * share, bytes=True)[:, :3]
-
-
-def unlit(corners: Array, colour: Array) -> bytes:
-    """Triangles as a glTF file, in a colour that light does not change.
+    Copy n stands ``APART`` · n along z. One of them is where it belongs, the others are further
+    than what is drawn. So a change of colour is a movement, which a page shows from one frame to
+    the next; a new file would have to be read first, with nothing to be seen meanwhile.
 
     Args:
         corners: Three for each triangle [m], shape (3 n, 3).
-        colour: Red, green and blue, 0 to 255.
     """
     import trimesh
 
@@ -373,9 +508,13 @@ def unlit(corners: Array, colour: Array) -> bytes:
             material["extensions"] = {"KHR_materials_unlit": {}}
             material["doubleSided"] = True
 
-    # glTF holds factors of linear light
-    linear = np.where(colour <= 10.3, colour / 255 / 12.92, ((colour / 255 + 0.055) / 1.055) ** 2.4)
-    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[*linear, 1.0])
-    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-    mesh.visual = trimesh.visual.TextureVisuals(material=material)
-    return bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), tree_postprocessor=tree))
+    scene, faces = trimesh.Scene(), np.arange(len(corners)).reshape(-1, 3)
+    for shade, colour in enumerate(signal_colours(np.arange(SHADES + 1) / SHADES)):
+        part = colour / 255  # glTF holds factors of linear light
+        linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+        mesh = trimesh.Trimesh(corners, faces, process=False)
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=[*linear, 1.0])
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        place = trimesh.transformations.translation_matrix([0.0, 0.0, APART * shade])
+        scene.add_geometry(mesh, node_name=f"{shade}", transform=place)
+    return bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=tree))

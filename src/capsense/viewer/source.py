@@ -50,6 +50,8 @@ class Source:
 
     def __init__(self, simulator: Simulator) -> None:
         self.design = simulator.design
+        self.cover = self.design.cover
+        """Of the sensor; None where it tells no touch."""
         self.green = simulator.background.green if simulator.method == "surface" else None
         """Of the sensor, where potentials can be had; None where they cannot."""
         self._simulator = simulator

@@ -11,15 +11,17 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capsense.errors import MissingDependencyError, ServerError
-from capsense.viewer.charts import PlaneControls, heat_map, make_charts, strip, touch_table
+from capsense.viewer.appearance import matter_legend
+from capsense.viewer.charts import STYLE, PlaneControls, heat_map, make_charts, strip, touch_table
 from capsense.viewer.player import Playback, Player
 
 try:
@@ -104,9 +106,11 @@ def status(player: Playback, frame: Frame, largest: float) -> str:
         'rgb(213,94,0));padding:0 2.5em;border-radius:2px">&nbsp;</span> '
         f"0 to {1e15 * largest:.3g} fF",
     ]
+    if matter := matter_legend(b.material for b in frame.around or frame.scene):
+        lines.append(f"bodies: {matter}")
     if player.failure is not None:
         lines.append(f'<b style="color:#b00020">{html.escape(str(player.failure))}</b>')
-    return f'<div style="padding:0.4em 0.8em;font-size:13px">{"<br>".join(lines)}</div>'
+    return f'{STYLE}<div style="padding:0.4em 0.8em;font-size:13px">{"<br>".join(lines)}</div>'
 
 
 SIZE = (720, 1280)
@@ -172,6 +176,22 @@ def _seen(client: Any) -> Any:
     return np.rint(cover * picture[..., :3] + 255 * (1 - cover)).astype(np.uint8)
 
 
+def add_views(gui: GuiApi, views: Mapping[str, tuple[Any, Any]]) -> None:
+    """Buttons that let the one who presses them look at the sensor, or at all of the robot.
+
+    Args:
+        gui: Where they are drawn.
+        views: Name → where the camera is, and what it looks at [m].
+    """
+    buttons = gui.add_button_group("look at", tuple(views))
+
+    def look(event: Any) -> None:
+        camera = event.client.camera
+        camera.position, camera.look_at = views[buttons.value]
+
+    buttons.on_click(look)
+
+
 PERIOD = 0.05
 """The page changes no more often [s]."""
 
@@ -199,8 +219,9 @@ class LiveView:
         gui.set_panel_label("capsense")
         gui.main_panel.dock_right()
         self._stage = source.stage(self.server)
-        self.status = gui.add_html("")
+        self.status = gui.add_html(STYLE)
         """The line of text about what is shown."""
+        add_views(gui, self._stage.views)
         self.time = TimeControls(gui, player)
         """The controls of time."""
         self._plane = PlaneControls(gui, player) if source.green is not None else None
@@ -210,13 +231,14 @@ class LiveView:
         self._charts = make_charts(gui, tab, source.channels)
         with tab:
             self._matrix = gui.add_html("")
-            cover = source.design.cover
+            cover = source.cover
             self._touch = None if cover is None else (gui.add_html(""), cover.limit)
         panel.dock_left()
         self._own = [k for k, c in enumerate(source.channels) if c.row == c.column]
         self._loudest = 1e-21
         self._drawn: tuple[object, ...] = ()
         self._painted: tuple[object, ...] = ()
+        self._eyes = np.empty((0, 3))
 
     @property
     def url(self) -> str:
@@ -234,7 +256,8 @@ class LiveView:
         """Show the newest, if it is not shown already."""
         player, frame = self._player, self._player.newest
         state = (frame, player.playing, player.failure)
-        if frame is not None and state != self._drawn:
+        changed = frame is not None and state != self._drawn
+        if frame is not None and changed:
             self._drawn = state
             with self.server.atomic():
                 self.time.show(frame)
@@ -252,11 +275,21 @@ class LiveView:
                     names, (table, limit) = frame.reading.electrode_names, self._touch
                     table.content = touch_table(names, frame.reading.touch, limit)
         self._paint()
+        eyes = self._where_eyes_are()
+        if changed or not np.array_equal(eyes, self._eyes):
+            self._eyes = eyes
+            self._stage.reveal(eyes)
 
     def stop(self) -> None:
         """Close the page."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
+
+    def _where_eyes_are(self) -> NDArray[np.float64]:
+        """Cameras of all who look [m], shape (e, 3)."""
+        cameras = [client.camera for client in self.server.get_clients().values()]
+        places = [camera.position for camera in cameras if camera.update_timestamp > 0]
+        return np.array(places).reshape(-1, 3)
 
     def _paint(self) -> None:
         """Show the potential, where there is one and it is wanted."""

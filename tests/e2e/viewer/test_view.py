@@ -19,9 +19,11 @@ from view_sources import Queued, until
 import capsense as cs
 from capsense._style import LOUD, QUIET
 from capsense.errors import ProtocolError, ServerError
+from capsense.reading import Touch
+from capsense.viewer.appearance import colour_of
 from capsense.viewer.plane import Plane, region
 from capsense.viewer.player import Follower
-from capsense.viewer.scene_drawing import SHADES, SceneDrawing
+from capsense.viewer.scene_drawing import APART, ARROW, FAR, SHADES, SceneDrawing
 from capsense.viewer.view import LiveView, check_address
 
 
@@ -124,24 +126,66 @@ def test_deforming_surfaces(server: Any) -> None:
 
 
 def test_signals(server: Any) -> None:
-    """From quiet to loud, and no further; light does not change the colours."""
+    """From quiet to loud, and no further; light does not change the colours.
+
+    One node an electrode holds it in all colours; that of the signal is where the electrode is.
+    """
     server.scene.reset()
-    stage = SceneDrawing(server, cs.load_design("patch"))
+    design = cs.load_design("patch")
+    stage = SceneDrawing(server, design)
+    handles = [nodes_of(server)[f"/electrodes/{k}"] for k in range(4)]
     stage.show_signals(np.array([0.0, 0.5, 1.0, 7.0]))
-    shown = {
-        n: h.glb_data for n, h in nodes_of(server).items()
-        if n.startswith("/electrodes/") and h.visible
-    }  # fmt: skip
-    assert sorted(shown) == [f"/electrodes/{k}-{s}" for k, s in enumerate((0, 16, SHADES, SHADES))]
+    assert [-h.position[2] / APART for h in handles] == [0, 16, SHADES, SHADES]
     stage.show_signals(np.zeros(4))
-    assert not nodes_of(server)[f"/electrodes/2-{SHADES}"].visible
-    for data, colour in ((shown["/electrodes/0-0"], QUIET), (shown["/electrodes/2-31"], LOUD)):
-        length = int.from_bytes(data[12:16], "little")
-        (material,) = json.loads(data[20 : 20 + length])["materials"]
-        assert material["extensions"] == {"KHR_materials_unlit": {}}
-        linear = np.array(material["pbrMetallicRoughness"]["baseColorFactor"][:3])
+    assert all(not h.position.any() and h.visible for h in handles)
+    assert [nodes_of(server)[f"/electrodes/{k}"] for k in range(4)] == handles
+    data = handles[0].glb_data
+    length = int.from_bytes(data[12:16], "little")
+    gltf = json.loads(data[20 : 20 + length])
+    assert len(gltf["nodes"]) >= SHADES + 1
+    at = {}
+    for node in gltf["nodes"]:
+        if "mesh" in node:
+            height = node.get("matrix", [0.0] * 16)[14]
+            material = gltf["meshes"][node["mesh"]]["primitives"][0]["material"]
+            at[round(height / APART)] = gltf["materials"][material]
+    assert sorted(at) == list(range(SHADES + 1))
+    assert APART > 10 * FAR
+    for shade, colour in ((0, QUIET), (SHADES, LOUD)):
+        assert at[shade]["extensions"] == {"KHR_materials_unlit": {}}
+        linear = np.array(at[shade]["pbrMetallicRoughness"]["baseColorFactor"][:3])
         srgb = np.where(linear < 0.0031, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
         np.testing.assert_allclose(255 * srgb, colour, atol=3)
+
+
+def test_force_is_an_arrow(server: Any) -> None:
+    """Onto the electrode, longest for the largest force so far; none where nothing presses."""
+    server.scene.reset()
+    design = cs.load_design("patch")
+    stage = SceneDrawing(server, design)
+    stage.show_touch(None)
+    assert "/touch" not in nodes_of(server)
+    nothing = np.zeros(4)
+    stage.show_touch(Touch(np.array([0.0, 2.0, 0.5, 0.0]), nothing, 2.5))
+    arrows = nodes_of(server)["/touch"]
+    tails, tips = arrows.points.astype(float).transpose(1, 0, 2)
+    middles = np.array([e.surface.bounds.mean(axis=0) for e in design.electrodes])
+    np.testing.assert_allclose(tips, middles[1:3], atol=1e-6)
+    np.testing.assert_allclose(tails - tips, [[0, 0, ARROW], [0, 0, ARROW / 4]], atol=1e-6)
+    stage.show_touch(Touch(nothing, nothing, 0.0))
+    assert not arrows.visible
+    stage.show_touch(Touch(np.array([1.0, 0.0, 0.0, 0.0]), nothing, 1.0))
+    assert nodes_of(server)["/touch"].visible
+    assert len(arrows.points) == 1
+
+
+@pytest.mark.parametrize("material", ["steel", "human", "wood", "PLA", "water"])
+def test_bodies_have_the_colour_of_their_material(server: Any, material: str) -> None:
+    server.scene.reset()
+    stage = SceneDrawing(server, cs.load_design("patch"))
+    ball = cs.Body(cs.Sphere(0.02), cs.Pose((0, 0, 0.1)), material)
+    stage.show_bodies(cs.Scene([ball]))
+    assert tuple(nodes_of(server)["/bodies/0"].color) == colour_of(ball.material)
 
 
 def test_plane(server: Any) -> None:

@@ -16,6 +16,7 @@ pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
 pytest.importorskip("playwright", reason="needs playwright: pip install playwright")
 
 from headless_browser import BROWSERS, browser_page, browser_path
+from view_sources import until
 
 import capsense as cs
 from capsense.scenario import Scenario, parse_scenario
@@ -91,7 +92,9 @@ def test_what_is_on_it(page: Any, scenario: Scenario) -> None:
     assert f"sample 0 of {last}" in text
     names = scenario.design.electrode_names
     assert len(page.evaluate(LINES)) == 2
-    for name in (*names, f"{names[0]}–{names[1]}", "Play", "1 V at", "plane across"):
+    legends = ("steel", "charge: 0.001 of", "the densest", "mV, doubling")
+    controls = ("Play", "1 V at", "plane across", "sensor", "charge on the bodies")
+    for name in (*names, f"{names[0]}–{names[1]}", *controls, *legends):
         assert name in text
 
 
@@ -134,8 +137,9 @@ def test_step(page: Any) -> None:
     wait_for_sample(page, 0)
 
 
-def test_play_and_pause(page: Any) -> None:
-    """Time runs, charts grow and vary; then both stand still."""
+def test_play_and_pause(page: Any, shown: tuple[Player, LiveView]) -> None:
+    """Time runs, charts grow and vary; then it stands still, and goes on by one when told."""
+    player, _ = shown
     press(page, "Play")
     page.wait_for_function(
         "() => Number(document.body.innerText.match(/sample (\\d+) of/)[1]) > 15"
@@ -145,21 +149,33 @@ def test_play_and_pause(page: Any) -> None:
     page.wait_for_function(f"() => ({LINES})().every(chart => chart.slice(1).some({varies}))")
     press(page, "Pause")
     page.get_by_role("button", name="Play", exact=True).wait_for()
-    page.wait_for_timeout(300)  # what was on its way arrives
-    stood, lines = sample(page), page.evaluate(LINES)
-    page.wait_for_timeout(300)
-    assert (sample(page), page.evaluate(LINES)) == (stood, lines)
-    for chart in lines:
-        assert (np.diff(chart[0]) > 0).all()
+    assert not player.playing
+    # What was being taken when it was told to pause is the last.
+    until(lambda: player.newest is not None and player.newest.index == player._position)
+    assert player.newest is not None
+    stood = player.newest.index
+    for number in (stood, stood + 1):
+        wait_for_sample(page, number)
+        page.wait_for_function(
+            f"at => ({LINES})().every(chart => Math.abs(chart[0].at(-1) - at) < 1e-9)",
+            arg=number / 25.0,
+        )
+        for chart in page.evaluate(LINES):
+            assert (np.diff(chart[0]) > 0).all()
+        if number == stood:
+            press(page, ">")
 
 
 def test_the_potential_is_drawn(page: Any) -> None:
     """The picture holds a colour of the potential, until it is not wanted."""
     press(page, "|<")
     wait_for_sample(page, 0)
-    assert painted(page, lambda count: count > 15) > 15
+    full = painted(page, lambda count: count > 25)
+    assert full > 25
     page.get_by_role("checkbox").nth(-2).click()
-    assert painted(page, lambda count: count < 10) < 10
+    assert painted(page, lambda count: count < full / 2) < full / 2
+    page.get_by_role("checkbox").nth(-2).click()
+    assert painted(page, lambda count: count > 0.7 * full) > 0.7 * full
 
 
 def test_pictures_are_handed_over(page: Any) -> None:

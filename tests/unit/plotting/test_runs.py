@@ -37,16 +37,17 @@ def lines_of(figure: object, title: str) -> dict[str, np.ndarray]:
 
 
 def test_readings(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
-    """Self capacitances over that of the empty scene; the ball's way beside them."""
+    """Changes of self capacitances from the empty scene; the ball's way beside them."""
     readings = [sim.step(scene) for scene in scenes]
     figure = cs.plot(readings, sim, scenes=scenes, excitation="self")
     drawn = lines_of(figure, "self capacitance")
     assert list(drawn) == ["E6", "E5", "E4", "E3", "E2", "E1"]
-    wanted = [r.self_capacitance[2] / sim.empty.self_capacitance[2] for r in readings]
-    np.testing.assert_allclose(drawn["E3"], wanted, rtol=1e-12)
-    assert figure.axes[1].get_xlabel() == "number of the reading"
+    wanted = [r.self_capacitance[2] - sim.empty.self_capacitance[2] for r in readings]
+    (axes,) = (a for a in figure.axes if a.get_ylabel() == "change from the empty scene [fF]")
+    np.testing.assert_allclose(drawn["E3"], 1e15 * np.array(wanted), rtol=1e-9)
+    assert axes.get_xlabel() == "number of the reading"
     timed = cs.plot(readings, sim, times=HEIGHTS, excitation="self")
-    assert timed.axes[1].get_xlabel() == "time [s]"
+    assert timed.axes[0].get_xlabel() == "time [s]"
     texts = [t.get_text() for axes in figure.axes for t in axes.texts]
     assert texts.count("ball") == texts.count("box") == 2
 
