@@ -20,7 +20,7 @@ from capsense.field.green import GreenFunction, build_green
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 19
+NUMERICS = 20
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 

@@ -33,6 +33,10 @@ _FLAT = 3e-3
 """Sheets of a flat design rise by less than this, over their width."""
 _RIM = 0.45
 """Behind free rims, which bodies can pass, the openness is larger."""
+_BETWEEN = 0.3
+"""Depth of point charges between two sheets, or behind one with a view on both sides, over the way
+through. Those of both sides stay apart: where they met, the potential was that of one layer, while
+it differs on both sides."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +158,7 @@ class Surroundings:
         view = openness(self.design, points + depth[:, None] * back)
         # bodies beside a rim come as close as those in front of it
         depth = np.where(view > _RIM, 0.35 * depth, depth)
-        depth = np.where(view > _OPEN, np.minimum(0.6 * path, depth), depth)
+        depth = np.where(view > _OPEN, np.minimum(_BETWEEN * path, depth), depth)
         return points + depth[:, None] * back
 
 
