@@ -359,6 +359,28 @@ def test_charges_behind_a_plate_stay_above_the_floor(backplane: float, slope: in
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("thickness", [0.8e-3, 1.6e-3, 5e-3])
+def test_charges_of_both_sides_of_a_stack_stay_apart(thickness: float) -> None:
+    """Invariant: those of a pad and of the plane behind it, which bodies see from below, are on
+    their own sides of the middle; where they met, both sides would have one potential."""
+    design = flat(
+        domain={"size": [0.2, 0.2, 0.2], "backplane": 0.06},
+        electrode=[square("A", 0.0, 0.03)],
+        conductor=[{"name": "back", "role": "shield", "shape": "rectangle",
+                    "size": [0.03, 0.03], "z": -thickness}],
+    )  # fmt: skip
+    surface = Surroundings(design, build_model(design, Accuracy(4.0)))
+    up = surface.normals[:, 2] > 0.0
+    assert 0.3 < up.mean() < 0.7
+    for depth in (0.5 * thickness, thickness, 1.7 * thickness, 0.02):
+        found = surface.behind(np.arange(len(up)), np.full(len(up), depth))
+        deep = np.where(up, -found[:, 2], found[:, 2] + thickness)
+        assert (deep > 0.0).all()
+        wide = np.abs(surface.points[:, :2]).max(axis=1) < 0.01
+        if depth > thickness:  # else they do not come out behind, where bodies can be
+            np.testing.assert_array_less(deep[wide], 0.4 * thickness)
+
+
 def test_spread_takes_the_farthest_point_every_time() -> None:
     points = np.random.default_rng(2).uniform(size=(400, 3)) * [1.0, 1.0, 0.0]
     chosen = spread(points, np.ones(400), 40)
