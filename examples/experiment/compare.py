@@ -64,8 +64,8 @@ CHIP_GAIN = 0.01
 """Standard uncertainty of the meter's gain."""
 RANGES = ((0.0, 5e-3), (5e-3, 50e-3), (50e-3, 1.0))
 """Of heights [m]: the upper end belongs to the range."""
-SMALL = 0.01
-"""Errors are relative to the change, or to this part of the channel's largest if that is more."""
+CLEAR = 0.03
+"""Errors count where noise and heights explain less than this part of the change."""
 
 
 class Statement(NamedTuple):
@@ -116,7 +116,7 @@ class Outcome:
     simulated: Array
     """Changes at the fitted heights [F], shape (n, K)."""
     error: Array
-    """Relative errors as :data:`SMALL` says, shape (n, K)."""
+    """Relative errors of the changes, shape (n, K); NaN where ``own`` is above :data:`CLEAR`."""
     own: Array
     """What of them the laboratory's noise, zero and stage explain, shape (n, K)."""
     gain: Array
@@ -342,15 +342,15 @@ def fit(
     seen = (measured - levels[which]) / gain
     seen[loose] = 0.0
     held = np.array([p.body in BODIES for p in positions])
-    size = np.maximum(np.abs(true), SMALL * np.abs(true[held]).max(axis=0))
+    size = np.where(true == 0.0, np.inf, np.abs(true))
     slope = np.zeros_like(true)
     slope[rows] = sum(_slopes(chosen, true[rows], zero, tilt, [], preset))
     unsure = {b: float(spread[k * (1 + len(covers)) + n]) for n, b in enumerate(names)}
     doubt = np.array([math.hypot(STAGE, unsure.get(p.body, 0.0)) for p in positions])[:, None]
+    own = np.hypot(noise / gain, slope * doubt) / size
+    clear = held[:, None] & (own <= CLEAR) & (true != 0.0)
     found = Outcome(
-        positions, seen, true,
-        np.where(held[:, None], (seen - true) / size, 0.0),
-        np.where(held[:, None], np.hypot(noise / gain, slope * doubt) / size, 0.0),
+        positions, seen, true, np.where(clear, (seen - true) / size, np.nan), own,
         gain, levels[0], levels[0] - gain * base, zero, tilt,
         {
             "gain": spread[:k],
@@ -531,11 +531,11 @@ def rms(
     """Root of the mean square of the relative errors, and of the laboratory's own share."""
     rows = _chosen(found, grounding, tuple(ranges), covered)
     columns = [CHANNELS.index(name) for name in channels]
-    if not rows.any():
+    clear = rows[:, None] & np.isin(np.arange(len(CHANNELS)), columns) & ~np.isnan(found.error)
+    if not clear.any():
         return math.nan, math.nan
-    return tuple(  # type: ignore[return-value]
-        float(np.sqrt((table[rows][:, columns] ** 2).mean())) for table in (found.error, found.own)
-    )
+    error, own = (float(np.sqrt((t[clear] ** 2).mean())) for t in (found.error, found.own))
+    return error, own
 
 
 def _ratios(found: Outcome, channels: Sequence[str], grounding: str) -> tuple[float, float]:
@@ -557,10 +557,11 @@ def _ratios(found: Outcome, channels: Sequence[str], grounding: str) -> tuple[fl
             {k: t[r][:, columns].mean(axis=0) for k, r in rows.items()}
             for t in (found.simulated, found.measured, found.own)
         )
-        largest = np.abs(found.simulated[:, columns]).max(axis=0)
-        clear = np.abs(true["ground"]) > SMALL * largest
-        errors.append((seen["other"] / seen["ground"] - true["other"] / true["ground"])[clear])
-        shares.append(np.hypot(own["other"], own["ground"])[clear])
+        share = np.hypot(own["other"], own["ground"])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = seen["other"] / seen["ground"] - true["other"] / true["ground"]
+        errors.append(error[share <= CLEAR])
+        shares.append(share[share <= CLEAR])
     if not errors or not np.concatenate(errors).size:
         return math.nan, math.nan
     return tuple(  # type: ignore[return-value]
@@ -573,17 +574,10 @@ def chip_noise(seconds: int = 60) -> float:
     """Standard deviation of means over 1 s of the FDC1004's preset at rest, 100 per second [F]."""
     chip = cs.Readout.preset("fdc1004", ("E1",), rate=100, seed=1)
     chip.reset()
-    still = _Still(np.array([[12e-12]]), np.zeros(1))
+    still = np.array([[12e-12]])
     means = [chip.sample(float(t), still).capacitance.mean() for t in range(1, seconds + 1)]
     # Neighbours, as repeated rows are: slow drift counts for little.
     return float(np.sqrt((np.diff(means) ** 2).mean() / 2))
-
-
-class _Still(NamedTuple):
-    """What a readout needs of a reading."""
-
-    capacitance: Array
-    shield_coupling: Array
 
 
 def report(found: Outcome) -> str:
@@ -605,7 +599,8 @@ def report(found: Outcome) -> str:
             + tail
         )
     heads = [f"{1e3 * low:g}-{1e3 * high:g} mm" for low, high in RANGES]
-    lines += ["", "rms | worst error in %, of grounded, floating and tied bodies without a cover",
+    lines += ["", "rms | worst error in % of grounded, floating and tied bodies without a cover,",
+              f"where the laboratory's own share is below {100 * CLEAR:g} %",
               "channel  all            " + "  ".join(f"{h:15s}" for h in heads)]  # fmt: skip
     bare = np.array([p.body in BODIES and p.cover == 0 for p in found.positions])
     height = np.array([p.height for p in found.positions])
@@ -613,6 +608,7 @@ def report(found: Outcome) -> str:
         cells = []
         for low, high in ((0.0, math.inf), *RANGES):
             e = 100 * found.error[bare & (height > low) & (height <= high), k]
+            e = e[~np.isnan(e)]
             cells.append(
                 f"{np.sqrt((e**2).mean()):5.2f} | {np.abs(e).max():5.2f}  " if e.size else "-"
             )

@@ -87,7 +87,7 @@ def drawing(design: Design) -> str:
         "       B_Cu: back copper, both seen from the front. Each landing has a plated hole of\n"
         "       0.4 mm, filled and capped. No solder mask on the front. -->\n"
         f'  <rect id="Edge_Cuts" x="{left:g}" y="{top:g}" width="{width:g}" height="{depth:g}" '
-        'fill="none" stroke="none"/>\n'
+        'fill="#e9e5d3" stroke="none"/>\n'
         f"{body}\n</svg>\n"
     )
 
