@@ -271,7 +271,7 @@ def _scene(key: tuple[Any, ...], zero: float, tilt: tuple[float, float]) -> cs.S
 
 
 def fit(
-    positions: list[Position], measured: Array, *, preset: str = "standard", tilted: bool = False
+    positions: list[Position], measured: Array, *, preset: str = "fine", tilted: bool = False
 ) -> Outcome:
     """Fit gains, levels, zeros and tilts by weighted least squares, and judge the statements.
 
@@ -650,6 +650,10 @@ def plot(found: Outcome, path: Path) -> None:
                  title=f"{bodies[0]}, grounded: measured (dots), simulated")  # fmt: skip
         right.set(xscale="log", xlabel="height [mm]", ylabel="error [%]",
                   title="grounded: errors; grey: limits of L, M and T")  # fmt: skip
+        # Below the noise a logarithmic axis shows nothing of use.
+        left.set_ylim(bottom=0.5e15 * found.noise.min())
+        for axes in (left, right):
+            axes.xaxis.set_major_formatter("{x:g}")
         left.legend(ncols=2)
         right.legend()
         figure.savefig(path)
@@ -661,7 +665,7 @@ def main(arguments: Sequence[str] | None = None) -> Outcome:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("measured", type=Path, help="the file, with the columns of measured.csv")
     parser.add_argument("-o", "--out", type=Path, default=Path("out"), help="folder of the plot")
-    parser.add_argument("--preset", default="standard", choices=("fast", "standard", "fine"))
+    parser.add_argument("--preset", default="fine", choices=("fast", "standard", "fine"))
     parser.add_argument("--tilt", action="store_true", help="fit the tilt of plate and disc too")
     options = parser.parse_args(arguments)
     try:

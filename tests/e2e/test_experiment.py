@@ -25,14 +25,14 @@ HEIGHTS = (0.5, 1, 2, 5, 10, 20)
 
 @pytest.fixture(scope="module")
 def files() -> Iterator[ModuleType]:
-    """``make_files``, with a coarser board, whose field is built in seconds."""
+    """``make_files``, with a coarser board, whose field is built sooner."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(FOLDER))
         module = importlib.import_module("make_files")
         exact = module.compare.board
 
         def coarse(*args: float) -> cs.design.Design:
-            return dataclasses.replace(exact(*args), build={"resolution": 0.4})
+            return dataclasses.replace(exact(*args), build={"resolution": 0.7})
 
         patch.setattr(module.compare, "board", coarse)
         yield module
@@ -128,7 +128,7 @@ def test_drawing_gives_the_same_areas(files: ModuleType, tmp_path: Path) -> None
     (plane,) = layout.nets["PLANE"].values()
     np.testing.assert_allclose(plane.area, areas["PLANE"], rtol=1e-3)
     assert layout.outline is not None
-    np.testing.assert_allclose(layout.outline.area, 0.1 * 0.08, rtol=1e-6)
+    np.testing.assert_allclose(layout.outline.area, 0.1 * 0.08, rtol=1e-5)
 
 
 def test_files_fit_each_other(files: ModuleType) -> None:
