@@ -50,6 +50,8 @@ BODIES: dict[str, tuple[Any, float, tuple[float, float, float]]] = {
 }
 """Shape, height of its origin above its lowest point [m], and angles [rad]. ``height_mm`` is that
 of the lowest point above the front copper."""
+TILTED = "plate"
+"""The body whose tilt can be told: what is centred over a pad changes with its square alone."""
 NO_BODY = ("empty", "open")
 """Rows of the board alone, and of the cables without the board."""
 FR4 = 4.5
@@ -107,7 +109,7 @@ class Position:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class LabFit:
     """What the fit found."""
 
     positions: list[Position]
@@ -272,7 +274,7 @@ def _scene(key: tuple[Any, ...], zero: float, tilt: tuple[float, float]) -> cs.S
 
 def fit(
     positions: list[Position], measured: Array, *, preset: str = "fine", tilted: bool = False
-) -> Outcome:
+) -> LabFit:
     """Fit gains, levels, zeros and tilts by weighted least squares, and judge the statements.
 
     Gauss-Newton: ``m = g ΔC(h + zero) + level``, with ΔC linear in zero and tilt between two
@@ -282,7 +284,7 @@ def fit(
         positions: Those of the file, in the order in which they were measured.
         measured: Capacitances [F], shape (n, K).
         preset: How finely bodies are resolved.
-        tilted: Whether plate and disc may be tilted.
+        tilted: Whether the plate may be tilted.
 
     Raises:
         ReadoutError: There are no rows without a body, or too few with one.
@@ -303,7 +305,7 @@ def fit(
             raise ReadoutError(
                 f"there are no rows with body = empty and cover_mm = {1e3 * cover:g}; measure some"
             )
-    turns = [b for b in names if tilted and b != "tube"]
+    turns = [b for b in names if tilted and b == TILTED]
     unknowns = k * (1 + len(covers)) + len(names) + 2 * len(turns)
     if len(rows) * k <= unknowns:
         raise ReadoutError(f"{len(rows)} rows for {unknowns} unknowns; measure more")
@@ -349,7 +351,7 @@ def fit(
     doubt = np.array([math.hypot(STAGE, unsure.get(p.body, 0.0)) for p in positions])[:, None]
     own = np.hypot(noise / gain, slope * doubt) / size
     clear = held[:, None] & (own <= CLEAR) & (true != 0.0)
-    found = Outcome(
+    found = LabFit(
         positions, seen, true, np.where(clear, (seen - true) / size, np.nan), own,
         gain, levels[0], levels[0] - gain * base, zero, tilt,
         {
@@ -468,7 +470,7 @@ def _permittivity(
     return float(weights @ each), float(weights @ sure)
 
 
-def _verdicts(found: Outcome) -> dict[str, tuple[float, float, str]]:
+def _verdicts(found: LabFit) -> dict[str, tuple[float, float, str]]:
     """Of each statement: confirmed, refuted, undecided, or not measured."""
     out = {}
     for statement in STATEMENTS:
@@ -487,7 +489,7 @@ def _verdicts(found: Outcome) -> dict[str, tuple[float, float, str]]:
     return out
 
 
-def _value(found: Outcome, key: str) -> tuple[float, float]:
+def _value(found: LabFit, key: str) -> tuple[float, float]:
     """What a statement is about, and the laboratory's own share; NaN if it was not measured."""
     big = ("L", "M", "T")
     if key == "near":
@@ -515,7 +517,7 @@ def _value(found: Outcome, key: str) -> tuple[float, float]:
 
 
 def _chosen(
-    found: Outcome, grounding: str, ranges: Iterable[tuple[float, float]], covered: bool = False
+    found: LabFit, grounding: str, ranges: Iterable[tuple[float, float]], covered: bool = False
 ) -> NDArray[np.bool_]:
     return np.array([
         p.body in BODIES and p.grounding == grounding and (p.cover > 0) == covered
@@ -525,7 +527,7 @@ def _chosen(
 
 
 def rms(
-    found: Outcome, channels: Sequence[str], grounding: str,
+    found: LabFit, channels: Sequence[str], grounding: str,
     ranges: Iterable[tuple[float, float]], *, covered: bool = False,
 ) -> tuple[float, float]:  # fmt: skip
     """Root of the mean square of the relative errors, and of the laboratory's own share."""
@@ -538,7 +540,7 @@ def rms(
     return error, own
 
 
-def _ratios(found: Outcome, channels: Sequence[str], grounding: str) -> tuple[float, float]:
+def _ratios(found: LabFit, channels: Sequence[str], grounding: str) -> tuple[float, float]:
     """Error of what a body not grounded changes, over what it changes where it is grounded."""
     columns = [CHANNELS.index(name) for name in channels]
     sums: dict[tuple[Any, ...], dict[str, list[int]]] = {}
@@ -580,7 +582,7 @@ def chip_noise(seconds: int = 60) -> float:
     return float(np.sqrt((np.diff(means) ** 2).mean() / 2))
 
 
-def report(found: Outcome) -> str:
+def report(found: LabFit) -> str:
     """Figures of the fit, the table of errors and the verdicts, as text."""
     lines = ["channel  gain               stray [pF]         noise [fF]"]
     for k, name in enumerate(CHANNELS):
@@ -592,8 +594,9 @@ def report(found: Outcome) -> str:
     for body, zero in found.zero.items():
         tail = ""
         if body in found.tilt:
-            one, two = (1e3 * a for a in found.tilt[body])
-            tail = f", tilt {one:+.3f} and {two:+.3f} mrad"
+            turns = zip(found.tilt[body], found.uncertainty["tilt"][body], strict=True)
+            tail = ", tilt " + " and ".join(f"{1e3 * a:+.3f} ± {1e3 * u:.3f}" for a, u in turns)
+            tail += " mrad"
         lines.append(
             f"zero of {body}: {1e6 * zero:+.1f} ± {1e6 * found.uncertainty['zero'][body]:.1f} µm"
             + tail
@@ -622,7 +625,7 @@ def report(found: Outcome) -> str:
     return "\n".join(lines)
 
 
-def plot(found: Outcome, path: Path) -> None:
+def plot(found: LabFit, path: Path) -> None:
     """Changes against height, and errors with the laboratory's own share."""
     import capsense.plotting  # noqa: F401  # its style sheet
 
@@ -660,13 +663,13 @@ def plot(found: Outcome, path: Path) -> None:
         plt.close(figure)
 
 
-def main(arguments: Sequence[str] | None = None) -> Outcome:
+def main(arguments: Sequence[str] | None = None) -> LabFit:
     """Read a file, fit, print and draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("measured", type=Path, help="the file, with the columns of measured.csv")
     parser.add_argument("-o", "--out", type=Path, default=Path("out"), help="folder of the plot")
     parser.add_argument("--preset", default="fine", choices=("fast", "standard", "fine"))
-    parser.add_argument("--tilt", action="store_true", help="fit the tilt of plate and disc too")
+    parser.add_argument("--tilt", action="store_true", help="fit the tilt of the plate too")
     options = parser.parse_args(arguments)
     try:
         positions, measured = read_rows(options.measured)
