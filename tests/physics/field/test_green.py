@@ -364,7 +364,7 @@ def test_charges_of_both_sides_of_a_stack_stay_apart(thickness: float) -> None:
     """Invariant: those of a pad and of the plane behind it, which bodies see from below, are on
     their own sides of the middle; where they met, both sides would have one potential."""
     design = flat(
-        domain={"size": [0.2, 0.2, 0.2], "backplane": 0.06},
+        domain={"size": [0.4, 0.4, 0.4], "backplane": 0.2},
         electrode=[square("A", 0.0, 0.03)],
         conductor=[{"name": "back", "role": "shield", "shape": "rectangle",
                     "size": [0.03, 0.03], "z": -thickness}],
