@@ -363,7 +363,10 @@ class Fleet:
             ReadoutError: There is no such environment, the seed is no whole number from 0 on, or a
                 time is not finite.
         """
-        rows = np.unique(chosen_rows(host_array(environments), self.count, ReadoutError))
+        found = chosen_rows(host_array(environments), self.count, ReadoutError)
+        rows, first = np.unique(found, return_index=True)
+        if np.shape(start) == found.shape:
+            start = np.asarray(host_array(start))[first]
         if self._chips is not None:
             with self._one:
                 self._chips.reset(rows, start=start, seed=seed)

@@ -436,6 +436,23 @@ def test_each_sensor_has_a_readout_of_its_own(device, tmp_path):
             both.use_readout(wrong)
 
 
+def test_starts_go_with_their_environments():
+    """Differential: numbers in any order, each with its start, as one reset for each of them."""
+    rng = np.random.default_rng(12)
+    fleets = [Fleet("six_patch", BODIES[:1], 5) for _ in range(2)]
+    where = poses(rng, 5, 1)
+    for fleet in fleets:
+        fleet.use_readout("fdc1004", seed=4)
+        fleet.step(where, time=0.05)
+    fleets[0].reset([4, 1, 4, 2], start=[0.4, 0.1, 0.4, 0.2], seed=8)
+    for number in (1, 2, 4):
+        fleets[1].reset(number, start=0.1 * number, seed=8)
+    held = [fleet.step(where, time=0.6).held for fleet in fleets]
+    for column in ("code", "age"):
+        np.testing.assert_array_equal(getattr(held[0], column), getattr(held[1], column))
+    assert len(np.unique(held[0].age[1:, 0, 0].round(6))) > 1
+
+
 def test_times_and_environments_on_the_device():
     """Differential: arrays of Warp beside those of the host, in single and double precision."""
     wp = pytest.importorskip("warp")
