@@ -109,9 +109,8 @@ def test_designs(validation: ModuleType, only: str, count: int) -> None:
     text = validation.designs(only)
     found = rows(text)
     assert len(found) == count
-    for name, (*changes, error) in found.items():
-        for change in changes:
-            assert max(map(abs, numbers(change)), default=0.0) < 4.0, name
+    for name, (pad, _, own, error) in found.items():
+        assert max(abs(numbers(pad)[0]), abs(numbers(own)[0])) < 3.0, name
         assert numbers(error)[0] < 0.5, name
     assert_on_page(text, 0.05)
 
