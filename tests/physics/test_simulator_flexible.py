@@ -11,7 +11,7 @@ from sheet_theory import first_order
 import capsense as cs
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path.append(str(ROOT / "benchmarks"))
 
 from flexible_scenes import grid_faces  # noqa: E402
 

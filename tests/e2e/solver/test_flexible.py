@@ -11,7 +11,7 @@ import pytest
 import capsense as cs
 
 ROOT = Path(__file__).parents[3]
-sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path.append(str(ROOT / "benchmarks"))
 
 import flexible  # noqa: E402
 
