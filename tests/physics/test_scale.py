@@ -134,7 +134,7 @@ def test_fleets_scale(device: str, monkeypatch: pytest.MonkeyPatch):
         poses[..., 6] = 1.0
         # not symmetric: where two points are nearest, rounding decides between them
         poses[:, 0, 2] = [1.1e-3, 1.6e-3]
-        poses[:, 1, :3] = [[1e-4, 1e-3, 5e-4], [1e-3, 0, 4e-3]]
+        poses[:, 1, :3] = [[7e-5, 1e-3, 5e-4], [1e-3, 0, 4e-3]]
         poses[:, 1, 3:] = [0.1, 0.2, 0.3, math.sqrt(0.86)]
         poses[..., :3] *= scale
         found = fleet.step(poses, jacobian=True)

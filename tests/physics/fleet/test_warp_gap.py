@@ -252,16 +252,25 @@ def test_bodies_are_pressed_into_a_cover(foam_field, grounding):
 @pytest.mark.parametrize("grounding", ["grounded", "floating"])
 def test_gradients_in_a_cover(foam_field, grounding):
     """Differential: central differences of readings, up to past full compression; measured 1e-3
-    (median) along axes, and 5e-3 about them."""
+    (median) along axes, and 5e-3 about them.
+
+    Of each scene the better of two widths counts: rounding makes the short one wrong, edges that
+    come into contact the long one.
+    """
     some = Fleet(foam_field, [cs.Body(cs.Sphere(0.01))], 1)
     scenes = near_scenes(some, 18, (-2.5e-3, 0.5e-3), grounding, seed=5)
     fleet = fleet_of(foam_field, scenes, device="warp:cpu")
     slope = fleet.step(scenes.poses, jacobian=True).jacobian.numpy()[:, 0, 0].astype(float)
-    truth, alike = differences(fleet, scenes.poses)
+    tried = [differences(fleet, scenes.poses, step=step) for step in (5e-6, 1e-5)]
     turns = np.array([not name.startswith("sphere") for name in scenes.names])
-    for half, some, most in ((slice(3), alike, 0.04), (slice(3, 6), alike & turns, 0.3)):
-        miss = np.abs(slope - truth)[some][..., half].max(axis=(1, 2, 3))
-        miss /= np.abs(truth)[some][..., half].max(axis=(1, 2, 3))
+    for half, which, most in ((slice(3), True, 0.04), (slice(3, 6), turns, 0.3)):
+        each = []
+        for truth, alike in tried:
+            miss = np.abs(slope - truth)[..., half].max(axis=(1, 2, 3))
+            miss /= np.abs(truth)[..., half].max(axis=(1, 2, 3))
+            each.append(np.where(alike & which, miss, np.inf))
+        miss = np.min(each, axis=0)
+        miss = miss[np.isfinite(miss)]
         assert len(miss) > 8
         assert miss.max() < most
         assert np.median(miss) < 2e-2
