@@ -52,7 +52,7 @@ def other_kind(path: Path, wanted: str, data: Mapping[str, Any] | None = None) -
     if data is None:
         try:
             data = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return None
     found = kind_of(data)
     if found in (None, wanted):

@@ -84,6 +84,15 @@ def test_wrong_command(
     assert {p.name for p in tmp_path.iterdir()} == {"ball.toml", "design.toml", "hand.mcap"}
 
 
+def test_files_that_cannot_be_read_are_of_no_kind(tmp_path: Path) -> None:
+    """Too deep, not TOML, or not there: what is wrong with them is told elsewhere."""
+    deep, odd = tmp_path / "deep.toml", tmp_path / "odd.toml"
+    deep.write_text("a = " + "[" * 100_000 + "]" * 100_000, encoding="utf-8")
+    odd.write_bytes(b"\xff\xfe=")
+    for path in (deep, odd, tmp_path / "absent.toml"):
+        assert other_kind(path, "design") is None
+
+
 def test_a_damaged_recording_is_not_taken_for_a_good_one(tmp_path: Path) -> None:
     """An .mcap file that is none is refused by what it lacks, not by its name."""
     path = tmp_path / "hand.mcap"
