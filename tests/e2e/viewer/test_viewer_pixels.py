@@ -150,12 +150,14 @@ def test_electrodes_stay_while_their_signals_rise(design: str) -> None:
         loud = f"p => p[2] < {LOUD[2] + TONE}"
         page.wait_for_function(f"() => window.seen.at(-1).every({loud})")
         seen = np.array(page.evaluate("() => window.seen"))
-    red, blue, alpha = seen[..., 0], seen[..., 2], seen[..., 3]
+    alpha = seen[..., 3]
+    # a pixel at a rim is covered in part, and has that part of the colour
+    red, blue = np.rint(seen[..., 0] * 255.0 / alpha), np.rint(seen[..., 2] * 255.0 / alpha)
     assert len(seen) > STEPS / 2
-    assert (alpha == 255).all(), "where an electrode was there is nothing"
+    assert alpha.min() >= 128, "where an electrode was there is nothing"
     assert red.min() > min(QUIET[0], LOUD[0]) - TONE
     assert red.max() < max(QUIET[0], LOUD[0]) + TONE, "an electrode shows what is behind it"
-    assert (np.diff(blue, axis=0) <= 0).all(), "it rises, from grey to orange"
+    assert (np.diff(blue, axis=0) <= 2).all(), "it rises, from grey to orange"
     assert min(len(np.unique(b)) for b in blue.T) > 5
 
 
