@@ -365,8 +365,9 @@ class Fleet:
         """
         found = chosen_rows(host_array(environments), self.count, ReadoutError)
         rows, first = np.unique(found, return_index=True)
-        if np.shape(start) == found.shape:
-            start = np.asarray(host_array(start))[first]
+        if start is not None:
+            start = np.asarray(host_array(start))
+            start = start[first] if start.shape == found.shape else start
         if self._chips is not None:
             with self._one:
                 self._chips.reset(rows, start=start, seed=seed)
