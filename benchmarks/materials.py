@@ -9,9 +9,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from pages import write_between
+
 from capsense.scene.materials import DATA, MATERIALS
 
-START, END = "<!-- materials -->", "<!-- end of materials -->"
+MARKERS = ("<!-- materials -->", "<!-- end of materials -->")
 
 
 def table() -> str:
@@ -34,12 +36,6 @@ def table() -> str:
     return "\n".join(lines)
 
 
-def replaced(page: str) -> str:
-    """A page with the table between its markers."""
-    before, _, rest = page.partition(START)
-    return f"{before}{START}\n\n{table()}\n\n{END}{rest.partition(END)[2]}"
-
-
 def main() -> None:
     """Print the table, or write it into a page."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -48,7 +44,7 @@ def main() -> None:
     if page is None:
         print(table())
     else:
-        page.write_text(replaced(page.read_text(encoding="utf-8")), encoding="utf-8")
+        write_between(page, MARKERS, table())
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sizes import write_between
+from pages import write_between
 
 import capsense as cs
 from capsense.errors import ReadoutError

@@ -62,7 +62,7 @@ def _changes(sim: cs.Simulator, scenes: list[Any], *, slopes: bool = False) -> R
             warnings.simplefilter("ignore", UserWarning)  # that an electrode lies in a body
             reading = sim.step(scene, jacobian=True) if slopes else sim.step(scene)
         row: dict[str, ArrayLike] = {"error": reading.stats.solver_error}
-        if reading.stats.solver_error < np.abs(reading.capacitance).max():  # else in contact
+        if not reading.in_contact:
             row["delta"] = reading.delta
         if reading.conductance is not None:
             row["conductance"] = reading.conductance

@@ -68,7 +68,7 @@ def by_simulator(
             )
         )
         truth[k, j] = reading.delta
-        contact[k, j] = reading.stats.solver_error >= np.abs(reading.capacitance).max()
+        contact[k, j] = reading.in_contact
     return truth, contact
 
 

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
 
 import pytest
+from benchmark_modules import imported
 
 from capsense.scene.materials import DATA, MATERIALS
 
 ROOT = Path(__file__).parents[3]
-SCRIPT = ROOT / "benchmarks" / "materials.py"
 PAGE = (ROOT / "docs" / "materials.md").read_text(encoding="utf-8")
 
 
 def test_the_page_is_up_to_date() -> None:
-    spec = importlib.util.spec_from_file_location("materials_page", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     write = "run python benchmarks/materials.py --write docs/materials.md"
-    assert module.replaced(PAGE) == PAGE, write
+    with imported("materials", "pages") as found:
+        materials = found["materials"]
+        assert found["pages"].replaced(PAGE, materials.MARKERS, materials.table()) == PAGE, write
 
 
 @pytest.mark.parametrize("name", MATERIALS)
