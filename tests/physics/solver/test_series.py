@@ -94,6 +94,17 @@ def test_losses_near_the_design(read):
     np.testing.assert_allclose(read(0.3e-3, of(4.0, 0.5)), steel, atol=0.02 * steel.max())
 
 
+@pytest.mark.parametrize("gap", [0.3e-3, 2e-3])
+def test_a_dielectric_of_two_parts(simulators, gap):
+    """Invariant: a box reads nearly as its two halves, which are dielectrics of their own."""
+    sim, half = simulators("six_patch"), cs.Box((0.04, 0.04, 0.02))
+    halves = [cs.Body(half, cs.Pose((x, 0.0, 0.01 + gap)), of(4.0)) for x in (-0.02, 0.02)]
+    whole = cs.Body(cs.Box((0.08, 0.04, 0.02)), cs.Pose((0.0, 0.0, 0.01 + gap)), of(4.0))
+    one = sim.step(cs.Scene([whole])).delta
+    two = sim.step(cs.Scene(halves)).delta
+    np.testing.assert_allclose(two, one, atol=0.1 * one.max())
+
+
 def test_other_bodies(read):
     """Invariant: what a body far away changes hardly depends on the dielectric's lift."""
     ball = cs.Body(cs.Sphere(0.03), cs.Pose((0.0, 0.0, 0.12)))

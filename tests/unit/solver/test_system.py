@@ -33,7 +33,7 @@ import capsense as cs
 from capsense._dense import substitute
 from capsense.solver.selection.selection_kernels import ActiveTree
 from capsense.solver.system.step import FIELD_ERROR, estimate, potential_change, solve, solve_each
-from capsense.solver.system.system_kernels import Reduced, _products, factorise, reduced
+from capsense.solver.system.system_kernels import Reduced, _products, factorise, part_of, reduced
 from capsense.solver.tree.dynamic_surface import DynamicBody
 
 
@@ -155,6 +155,25 @@ def test_scenes_one_after_another() -> None:
         assert (error[k], size[k]) == (wanted.error, wanted.size)
         assert error[k] > 0
     assert np.abs(delta[1]).max() == error[1] == size[1] == 0
+
+
+@pytest.mark.parametrize("wanted", [[1, 0, 0], [0, 1, 1], [0, 0, 0]])
+def test_system_of_some_bodies(wanted: list[bool]) -> None:
+    """Differential: what these bodies change by themselves, with all functions."""
+    bodies, some = scenes()["three of all kinds"].packed(), np.array(wanted, bool)
+    _, _, functions, system = prepared_alone(bodies, 1e-9)
+    part, theirs = part_of(functions, system, some)
+    assert part.solved == np.count_nonzero(some[functions.body[: functions.solved]])
+    alone = bodies[some]
+    alone["group"] = np.arange(len(alone))
+    if not some.any():
+        assert part.cluster.shape == (0,)
+        return
+    _, _, own, exactly = prepared_alone(alone, 1e-9)
+    found, expected = reduced(part, theirs, False), reduced(own, exactly, False)
+    np.testing.assert_array_equal(part.cluster.shape, own.cluster.shape)
+    np.testing.assert_allclose(found.delta, expected.delta, atol=2e-6 * expected.delta.max())
+    np.testing.assert_allclose(found.left, expected.left, atol=2e-6 * expected.delta.max())
 
 
 def test_potentials_that_charges_change() -> None:

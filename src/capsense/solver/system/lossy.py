@@ -13,7 +13,7 @@ from capsense.solver.gap.body_gap_kernels import facing_of
 from capsense.solver.gap.gap_kernels import fabric_change, near_bodies, press_out
 from capsense.solver.gap.series_kernels import in_series_lossy
 from capsense.solver.interaction.layer_kernels import face_charges, faces_of, fine_layers
-from capsense.solver.system.step import SERIES, Solution, estimate, only, prepared, solve_lifted
+from capsense.solver.system.step import SERIES, Solution, conductors_of, estimate, only, prepared
 from capsense.solver.system.system_kernels import COARSE, GAIN, factorise, leaf_charges
 
 
@@ -57,9 +57,7 @@ def solve_lossy(
             alone, ties[near], inverse_susceptibility[near], green, threshold, width
         ).delta
     alone["inverse_susceptibility"] = 0.0
-    high = np.asarray(solve_lifted(alone, green, threshold, width, False).delta)
-    alone["outline"] = 0
-    low = np.asarray(solve_lifted(alone, green, threshold, width, False).delta)
+    low, high = conductors_of(alone, green, threshold, width)
     change = in_series_lossy(own, low, high) - own
     delta = found.delta + change
     doubt = SERIES * np.abs(np.diag(change))[: green.electrodes].max(initial=0.0)

@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from capsense._dense import WIDTH, padded
+from capsense._dense import padded
 from capsense._jit import compiled, kernel
-from capsense._simd import doubles, integers
+from capsense._simd import SIMD_WIDTH, doubles, integers
 from capsense.field.face_kernels import looseness, off_walls, smooth
 from capsense.solver.system.system_kernels import System
 from capsense.solver.tree.matter import FLOATING_PENALTY
@@ -172,7 +172,7 @@ def add_ties(bodies, node, local, matrix):
 def with_nodes(system, functions, node, terminals, nodes):
     """Give a system a right-hand side for each node at 1 V, behind those of the terminals."""
     total = system.phi.shape[0]
-    phi = np.zeros((total, padded(terminals + nodes, WIDTH)))
+    phi = np.zeros((total, padded(terminals + nodes, SIMD_WIDTH)))
     for f in range(total):
         for i in range(terminals):
             phi[f, i] = system.phi[f, i]

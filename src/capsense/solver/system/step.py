@@ -58,6 +58,7 @@ from capsense.solver.system.system_kernels import (
     System,
     assembled,
     leaf_charges,
+    part_of,
     reduced,
 )
 
@@ -188,24 +189,17 @@ def _solve(
     """As :func:`solve`, but for a fabric on the cover."""
     soft = near_bodies(bodies, green, np.bool_(True))
     if not soft.any():
-        return solve_lifted(bodies, green, threshold, width, adjoint)
+        return solve_lifted(bodies, soft, green, threshold, width, adjoint).solution
     bodies = bodies.copy()
     press_out(bodies, soft, green)
-    found = solve_lifted(bodies, green, threshold, width, adjoint)
-    m, plain = green.terminals, np.bool_(False)  # the literal would compile another version
-    alone = only(bodies, soft)
-    own = found.delta
-    if not soft.all():
-        own = solve_lifted(alone, green, threshold, width, plain).delta
-    for b in range(alone.shape[0]):
-        alone[b].inverse_susceptibility = 0.0
-    high = solve_lifted(alone, green, threshold, width, plain).delta
-    for b in range(alone.shape[0]):
-        alone[b].outline = 0  # lifted, and nothing is added
-    low = solve_lifted(alone, green, threshold, width, plain).delta
+    found, own, _ = solve_lifted(bodies, soft, green, threshold, width, adjoint)
+    stiff = only(bodies, soft)
+    for b in range(stiff.shape[0]):
+        stiff[b].inverse_susceptibility = 0.0
+    low, high = conductors_of(stiff, green, threshold, width)
     change, doubt = difference(in_series(own, low, high), own), 0.0
-    for i in range(m):
-        for j in range(m):
+    for i in range(green.terminals):
+        for j in range(green.terminals):
             found.delta[i, j] += change[i, j]
         if i < green.electrodes:
             doubt = max(doubt, SERIES * abs(change[i, i]))
@@ -228,6 +222,16 @@ def _solve(
 
 
 @compiled
+def conductors_of(
+    bodies: NDArray[np.void], green: Green, threshold: float, width: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Change of the Maxwell matrix [m] by conductors: lifted ones, and by the gap law, (m, m)."""
+    none, plain = np.zeros(bodies.shape[0], np.bool_), np.bool_(False)
+    found = solve_lifted(bodies, none, green, threshold, width, plain)
+    return found.lifted, found.solution.delta
+
+
+@compiled
 def only(bodies: NDArray[np.void], wanted: NDArray[np.bool_]) -> NDArray[np.void]:
     """Some bodies, by themselves: what a lift changes of near dielectrics is local."""
     out, first, count = bodies.copy(), np.full(bodies.shape[0], -1), 0
@@ -241,11 +245,30 @@ def only(bodies: NDArray[np.void], wanted: NDArray[np.bool_]) -> NDArray[np.void
     return out[:count]
 
 
+class Lifted(NamedTuple):
+    """What a scene does in which nothing is added to near dielectrics of what the lift removes."""
+
+    solution: Solution
+    """Conductors are by the gap law."""
+    own: NDArray[Any]
+    """Change of the Maxwell matrix by some of the bodies by themselves [m], shape (m, m)."""
+    lifted: NDArray[Any]
+    """Change of it by all where nothing is added to conductors, either [m], shape (m, m)."""
+
+
 @compiled
 def solve_lifted(
-    bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
-) -> Solution:
-    """As :func:`solve`; of near dielectrics, nothing of what the lift removes is added."""
+    bodies: NDArray[np.void],
+    some: NDArray[np.bool_],
+    green: Green,
+    threshold: float,
+    width: float,
+    adjoint: bool,
+) -> Lifted:
+    """As :func:`solve`, of bodies where the lift has them, for :class:`Lifted`.
+
+    ``some`` are the bodies whose own change is asked for, shape (b,); none of them is a node.
+    """
     near, facing = near_bodies(bodies, green, np.bool_(False)), facing_of(bodies)
     placed_as, scored, lifted, tied = bodies, bodies, near.copy(), any_tied(bodies)
     if near.any() or facing.pairs > 0 or tied:
@@ -260,25 +283,32 @@ def solve_lifted(
         scored = bodies
     cut, leaves, functions, system = prepared(bodies, green, threshold, width, facing, scored)
     fine = fine_layers(bodies, functions, system.phi, green)
+    own = np.zeros((m, m))
+    if some.any():
+        few, theirs = part_of(functions, system, some)
+        part = reduced(few, theirs, np.bool_(False)).delta
+        for i in range(m):
+            for j in range(m):
+                own[i, j] = part[i, j]
     if nodes > 0:
         system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     leaves, first = faces_of(leaves)
     charge = face_charges(charge, first)
-    weights, doubt = np.zeros((m, m)), 0.0
+    weights, doubt, plain = np.zeros((m, m)), 0.0, delta
     if near.any() or tied:
-        thin, plain = slenderness(bodies, lifted, green.gap.validity), delta.copy()
-        local_change(bodies, lifted, node, green, delta)
         add_between(placed_as, facing, node, delta)
         add_ties(bodies, node, green.local, delta)
+        plain = delta.copy()
+        local_change(bodies, lifted, node, green, delta)
+        before = potentials_of(plain, m, nodes, capacitance)
+        plain = congruent(before, plain, capacitance)
         weights = potentials_of(delta, m, nodes, capacitance)
         delta, left = congruent(weights, delta, capacitance), congruent(weights, left, np.zeros(0))
         charge, coarse = mixed(charge, weights, green.phi_columns), coarse_of(coarse, weights)
+        thin = slenderness(bodies, lifted, green.gap.validity)
         if thin > 0.0:  # the local change is that by a plane in front of the design
-            add_ties(bodies, node, green.local, plain)
-            before = potentials_of(plain, m, nodes, capacitance)
-            plain = congruent(before, plain, capacitance)
             for i in range(green.electrodes):
                 doubt = max(doubt, thin * abs(delta[i, i] - plain[i, i]))
     for b in range(bodies.shape[0]):
@@ -289,7 +319,7 @@ def solve_lifted(
                     delta[i, j] += part * fine[b, i, j]
                     left[i, j] += SERIES * part * fine[b, i, j]
     error = estimate(delta, left, coarse[:m], shift, green.electrodes) + doubt
-    return Solution(
+    solution = Solution(
         delta[:m, :m],
         left[:m, :m],
         coarse[:m],
@@ -305,6 +335,7 @@ def solve_lifted(
         node,
         weights,
     )
+    return Lifted(solution, own, plain[:m, :m].copy())
 
 
 @compiled

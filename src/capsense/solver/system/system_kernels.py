@@ -33,7 +33,7 @@ from capsense._simd import (
     wide_splat,
 )
 from capsense.solver.placement.truncation_kernels import add_own
-from capsense.solver.selection.selection_kernels import is_there
+from capsense.solver.selection.selection_kernels import Functions, is_there
 
 SHEET = 6.0
 """Impedance of a thin sheet to charge that moves from one part of a cluster to the other, times its
@@ -243,6 +243,35 @@ def _add_matter(bodies, functions, matrix, own):
             own[f] += more
             if f < solved:
                 matrix[f, f] += more
+
+
+@compiled
+def part_of(functions, system, wanted):
+    """The functions of the wanted bodies (b,), and their system, as if there were no others."""
+    total, count, solved = functions.cluster.shape[0], 0, 0
+    kept = np.empty(total, np.int64)
+    for f in range(total):
+        if wanted[functions.body[f]]:
+            kept[count] = f
+            count += 1
+            solved += f < functions.solved
+    kept = kept[:count]
+    phi = np.empty((count, system.phi.shape[1]))
+    matrix, rest = np.empty((solved, solved)), np.empty((count - solved, solved))
+    for a in range(count):
+        f = kept[a]
+        phi[a] = system.phi[f]
+        for b in range(solved):
+            if a < solved:
+                matrix[a, b] = system.matrix[f, kept[b]]
+            else:
+                rest[a - solved, b] = system.rest[f - functions.solved, kept[b]]
+    part = Functions(
+        functions.cluster[kept], functions.net[kept], functions.number[kept],
+        functions.body[kept], functions.fade[kept], functions.parent_fade[kept],
+        functions.panel_end_fraction[kept], solved,
+    )  # fmt: skip
+    return part, System(phi, matrix, rest, system.diagonal[kept])
 
 
 @compiled
