@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from machine import describe_machine
+from pages import write_between
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
@@ -41,7 +42,7 @@ from capsense.fleet.warp_core import known_device
 
 SECONDS = 540.0
 STEPS = 5
-START, END = "<!-- gpu -->", "<!-- end of gpu -->"
+MARKERS = "<!-- gpu -->", "<!-- end of gpu -->"
 CHAINS, LENGTH = 8, 256
 """Multiply-adds of a thread that do not wait for each other, and how many follow each other."""
 MEAN, SOURCE = 60, 68
@@ -336,20 +337,6 @@ def table(found: dict[str, Any]) -> str:
     return "\n".join(out)
 
 
-def write_table(page: Path, text: str) -> None:
-    """Put a table between the marks of a page.
-
-    Raises:
-        ValueError: The page does not have both marks.
-    """
-    whole = page.read_text(encoding="utf-8")
-    before, start, rest = whole.partition(START)
-    _, end, after = rest.partition(END)
-    if not start or not end:
-        raise ValueError(f"{page} has no lines {START!r} and {END!r}; add them")
-    page.write_text(f"{before}{START}\n{text}\n{END}{after}", encoding="utf-8")
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--device", default="cuda:0", help="cuda:0, or warp:cpu for tests")
@@ -369,7 +356,7 @@ def main(arguments: list[str] | None = None) -> int:
     options.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(table(found))
     if options.write is not None:
-        write_table(options.write, table(found))
+        write_between(options.write, MARKERS, table(found))
     return 0
 
 

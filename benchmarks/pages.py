@@ -22,6 +22,12 @@ def replaced(page: str, markers: Markers, text: str) -> str:
 
 
 def write_between(path: Path, markers: Markers, text: str) -> None:
-    """Replace what stands between two markers of a file."""
+    """Replace what stands between two markers of a file.
+
+    Raises:
+        ValueError: The file does not have both.
+    """
     page = path.read_text(encoding="utf-8")
+    if markers[1] not in page.partition(markers[0])[2]:
+        raise ValueError(f"{path} has no lines {markers[0]!r} and {markers[1]!r}; add them")
     path.write_text(replaced(page, markers, text), encoding="utf-8")

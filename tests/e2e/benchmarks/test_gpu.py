@@ -25,7 +25,7 @@ def gpu() -> Iterator[ModuleType]:
 def test_one_command_measures_all(gpu: ModuleType, tmp_path: Path) -> None:
     """JSON holds what the docs name, all above zero; the table stands between the marks."""
     page, file = tmp_path / "page.md", tmp_path / "out" / "gpu.json"
-    page.write_text(f"before\n{gpu.START}\nold\n{gpu.END}\nafter\n", encoding="utf-8")
+    page.write_text(f"before\n{gpu.MARKERS[0]}\nold\n{gpu.MARKERS[1]}\nafter\n", encoding="utf-8")
     assert gpu.main([*SMALL, "-o", str(file), "--write", str(page)]) == 0
     found = json.loads(file.read_text(encoding="utf-8"))
     (row,) = found["rates"]
@@ -44,8 +44,10 @@ def test_one_command_measures_all(gpu: ModuleType, tmp_path: Path) -> None:
     if "simulator" in found:
         assert 0.0 < found["simulator"]["share"] < 1.0
     text = page.read_text(encoding="utf-8")
-    assert text.startswith(f"before\n{gpu.START}\n`python benchmarks/gpu.py --device warp:cpu`")
-    assert text.endswith(f"\n{gpu.END}\nafter\n")
+    assert text.startswith(
+        f"before\n{gpu.MARKERS[0]}\n`python benchmarks/gpu.py --device warp:cpu`"
+    )
+    assert text.endswith(f"\n{gpu.MARKERS[1]}\nafter\n")
     assert "old" not in text
     assert f"| 32 | 2 | {row['solves']:,.0f} |" in text
 
@@ -75,9 +77,9 @@ def test_errors_name_the_fix(
     gpu: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "page.md"
-    page.write_text(gpu.START, encoding="utf-8")
+    page.write_text(gpu.MARKERS[0], encoding="utf-8")
     with pytest.raises(ValueError, match="has no lines"):
-        gpu.write_table(page, "")
+        gpu.write_between(page, gpu.MARKERS, "")
     with pytest.raises(SystemExit):
         gpu.main(["--device", "warp:nothing"])
     assert "there are cpu, warp:cpu" in capsys.readouterr().err
