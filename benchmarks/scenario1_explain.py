@@ -142,7 +142,9 @@ class Ceiling:
 
 
 def ceilings(
-    curve: Callable[[Values], Array], measured: Array, groups: Mapping[str, Mapping[str, Any]]
+    curve: Callable[[Values], Array],
+    measured: Array,
+    groups: Mapping[str, Mapping[str, tuple[float, float]]],
 ) -> dict[str, Ceiling]:
     """Fit each group of values to a recording, the others kept: an explanation, no prediction.
 
@@ -155,24 +157,26 @@ def ceilings(
         By group; first ``"as foretold"``, last ``"all of these"``.
     """
     whole = {key: value for group in groups.values() for key, value in group.items()}
-    found = {}
-    for name, group in {"as foretold": {}, **groups, "all of these": whole}.items():
-        start = np.array([begin for begin, _ in group.values()])
-        step = np.array([size for _, size in group.values()])
+    asked = {"as foretold": {}, **groups, "all of these": whole}
+    return {name: _ceiling(curve, measured, group) for name, group in asked.items()}
 
-        def values(vector: Array, group=group, start=start, step=step) -> dict[str, float]:  # type: ignore[no-untyped-def]
-            return dict(zip(group, (start + vector * step).tolist(), strict=True))
 
-        best: dict[str, float] = {}
-        if group:
-            result = least_squares(
-                lambda vector, values=values: curve(values(vector)) - measured,
-                np.zeros(len(group)), x_scale=1.0, diff_step=1e-3,
-            )  # fmt: skip
-            best = values(result.x)
-        fitted = curve(best)
-        found[name] = Ceiling(cross_correlation(fitted, measured), rmse(fitted, measured), best)
-    return found
+def _ceiling(
+    curve: Callable[[Values], Array], measured: Array, group: Mapping[str, tuple[float, float]]
+) -> Ceiling:
+    start = np.array([begin for begin, _ in group.values()])
+    step = np.array([size for _, size in group.values()])
+
+    def values(vector: Array) -> dict[str, float]:
+        return dict(zip(group, (start + vector * step).tolist(), strict=True))
+
+    best: dict[str, float] = {}
+    if group:
+        zeros = np.zeros(len(group))
+        result = least_squares(lambda v: curve(values(v)) - measured, zeros, diff_step=1e-3)
+        best = values(result.x)
+    fitted = curve(best)
+    return Ceiling(cross_correlation(fitted, measured), rmse(fitted, measured), best)
 
 
 def noise_ceiling(measured: Array) -> float:
