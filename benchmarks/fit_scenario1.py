@@ -55,6 +55,8 @@ from capsense.simulator import Simulator
 BOARDS = ("stripe", "patch")
 PREDICTED = "patch_T4"
 DRAWS = 200
+RECORDINGS = 1000
+"""Drawn to explain the predicted panel's correlation."""
 AIM = 0.985
 """Zero-mean correlation that the predicted panel should have with hardware."""
 
@@ -228,7 +230,7 @@ def print_explained(result: Fit, sims: dict[str, Simulator], grids: dict[str, Gr
         moved = random.uniform(-0.5, 0.5) / setup.sample_rate
         return other({"rest": setup.rest + moved}) - curve
 
-    drawn = iter(result.drawn(DRAWS))
+    drawn = iter(result.drawn(RECORDINGS))
     found = expected(
         curve,
         {
@@ -244,12 +246,12 @@ def print_explained(result: Fit, sims: dict[str, Simulator], grids: dict[str, Gr
             ),
             "solver: preset fine": lambda _: solver,
         },
-        draws=DRAWS,
+        draws=RECORDINGS,
     )
     total = found.total
     print(
-        f"\n{PREDICTED} and {DRAWS} drawn recordings: zero-mean correlation {total.median:.4f}, "
-        f"90 % within {total.low:.4f} to {total.high:.4f}; median with a source alone; with it "
+        f"\n{PREDICTED} and {RECORDINGS} drawn recordings: zero-mean correlation "
+        f"{total.median:.4f}, 90 % within {total.low:.4f} to {total.high:.4f}; median with a source alone; with it "
         "removed"
     )
     for name, alone in found.alone.items():
@@ -267,7 +269,11 @@ def print_explained(result: Fit, sims: dict[str, Simulator], grids: dict[str, Gr
     print(f"\nchanges that alone lower it to {AIM}")
     for key in (f"{PREDICTED}.pace", *setup.uncertainty):
         value = setup.value(key)
-        size = tolerance(lambda part, k=key, v=value: other({k: v * (1 + part)}), AIM, largest=0.5)
+
+        def scaled(part: float, key: str = key, value: float = value) -> Array:
+            return other({key: value * (1 + part)})
+
+        size = tolerance(scaled, AIM, largest=0.5)
         text = f"{100 * size:.2g} %, {size * value:.2g}" if size else "none up to 50 %"
         print(f"  {key}: {text}")
     print_eased(result, tables)

@@ -182,7 +182,7 @@ def _ceiling(
 def noise_ceiling(measured: Array) -> float:
     """The zero-mean correlation of a recording with the same without its white noise."""
     share = sample_noise(measured) ** 2 / np.var(measured)
-    return float(np.sqrt(max(0.0, 1 - share)))
+    return float(np.sqrt(max(0.0, float(1 - share))))
 
 
 def eased(times: Array, legs: Sequence[float] | Array, settle: float) -> Array:
