@@ -4,7 +4,7 @@ Prints the figures for ``src/capsense/reproduce/data/scenario1.toml``, how far t
 fit interpolates is from the simulation, and, if asked, how well each panel is foretold from the
 others, how well the predicted panel is known, what limits its correlation with a recording, and
 how well other pairs and pours fit. ``python benchmarks/fit_scenario1.py`` takes seconds once the
-fields are built, ``--explain`` and ``--pairs`` a minute.
+fields are built, ``--pairs`` a minute, ``--explain`` three.
 """
 
 from __future__ import annotations
@@ -251,8 +251,8 @@ def print_explained(result: Fit, sims: dict[str, Simulator], grids: dict[str, Gr
     total = found.total
     print(
         f"\n{PREDICTED} and {RECORDINGS} drawn recordings: zero-mean correlation "
-        f"{total.median:.4f}, 90 % within {total.low:.4f} to {total.high:.4f}; median with a source alone; with it "
-        "removed"
+        f"{total.median:.4f}, 90 % within {total.low:.4f} to {total.high:.4f}; median "
+        "with a source alone; with it removed"
     )
     for name, alone in found.alone.items():
         print(f"  {name}: {alone.median:.5f}; {found.removed[name].median:.4f}")
