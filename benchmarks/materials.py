@@ -18,14 +18,16 @@ MARKERS = ("<!-- materials -->", "<!-- end of materials -->")
 
 def table() -> str:
     """Materials and paths to ground of ``materials.toml``, in Markdown."""
-    lines = ["| material | ε<sub>r</sub> | σ (S/m) | conductor at 250 kHz |"]
-    lines.append("| --- | --- | --- | --- |")
+    lines = ["| material | ε<sub>r</sub> | σ (S/m) |", "| --- | --- | --- |"]
     for name, m in MATERIALS.items():
         sigma = f"{m.sigma:.3g}" if m.sigma else "–"
-        conducts = "yes" if m.is_conductor() else "no"
-        if m.is_conductor() != m.is_conductor(1e6):
-            conducts += "; at 1 MHz " + ("no" if conducts == "yes" else "yes")
-        lines.append(f"| {name} | {m.eps_r:g} | {sigma} | {conducts} |")
+        lines.append(f"| {name} | {m.eps_r:g} | {sigma} |")
+    conductors = [name for name, m in MATERIALS.items() if m.is_conductor()]
+    lost = [name for name in conductors if not MATERIALS[name].is_conductor(1e6)]
+    lines += [
+        "",
+        f"Conductors at 250 kHz: {', '.join(conductors)}; at 1 MHz not: {', '.join(lost)}.",
+    ]
     other = ", ".join(f"{new} = {old}" for new, old in DATA["aliases"].items())
     lines += ["", f"Other names: {other}.", ""]
     lines += ["| path to ground | C (pF) | in series (Ω) | source |", "| --- | --- | --- | --- |"]
