@@ -30,11 +30,11 @@ def table() -> str:
     ]
     other = ", ".join(f"{new} = {old}" for new, old in DATA["aliases"].items())
     lines += ["", f"Other names: {other}.", ""]
-    lines += ["| path to ground | C (pF) | in series (Ω) | source |", "| --- | --- | --- | --- |"]
+    lines += ["| path to ground | C (pF) | in series (Ω) |", "| --- | --- | --- |"]
     for name, path in DATA["ground_paths"].items():
         series = f"{path['series']:g}" if "series" in path else "–"
         farads = f"{path['capacitance'] * 1e12:g}"
-        lines.append(f"| {name} | {farads} | {series} | {path['source']} |")
+        lines.append(f"| {name} | {farads} | {series} |")
     return "\n".join(lines)
 
 
