@@ -18,21 +18,23 @@ MARKERS = ("<!-- materials -->", "<!-- end of materials -->")
 
 def table() -> str:
     """Materials and paths to ground of ``materials.toml``, in Markdown."""
-    lines = ["| material | ε<sub>r</sub> | σ (S/m) | conductor at 250 kHz | source |"]
-    lines.append("| --- | --- | --- | --- | --- |")
+    lines = ["| material | ε<sub>r</sub> | σ (S/m) |", "| --- | --- | --- |"]
     for name, m in MATERIALS.items():
         sigma = f"{m.sigma:.3g}" if m.sigma else "–"
-        conducts = "yes" if m.is_conductor() else "no"
-        if m.is_conductor() != m.is_conductor(1e6):
-            conducts += "; at 1 MHz " + ("no" if conducts == "yes" else "yes")
-        lines.append(f"| {name} | {m.eps_r:g} | {sigma} | {conducts} | {m.source} |")
+        lines.append(f"| {name} | {m.eps_r:g} | {sigma} |")
+    conductors = [name for name, m in MATERIALS.items() if m.is_conductor()]
+    lost = [name for name in conductors if not MATERIALS[name].is_conductor(1e6)]
+    lines += [
+        "",
+        f"Conductors at 250 kHz: {', '.join(conductors)}; at 1 MHz not: {', '.join(lost)}.",
+    ]
     other = ", ".join(f"{new} = {old}" for new, old in DATA["aliases"].items())
     lines += ["", f"Other names: {other}.", ""]
-    lines += ["| path to ground | C (pF) | in series (Ω) | source |", "| --- | --- | --- | --- |"]
+    lines += ["| path to ground | C (pF) | in series (Ω) |", "| --- | --- | --- |"]
     for name, path in DATA["ground_paths"].items():
         series = f"{path['series']:g}" if "series" in path else "–"
         farads = f"{path['capacitance'] * 1e12:g}"
-        lines.append(f"| {name} | {farads} | {series} | {path['source']} |")
+        lines.append(f"| {name} | {farads} | {series} |")
     return "\n".join(lines)
 
 

@@ -120,7 +120,7 @@ def shown(distance: float, whole: bool = True) -> str:
 
 
 def row(name: str, chips: Sequence[str]) -> list[str]:
-    """Cells of a design: hand / ball for each chip."""
+    """Cells of a design: hand/ball for each chip, one dash where neither is told."""
     sim = cs.Simulator(name)
     readings = {body: changes(sim, make) for body, make in BODIES.items()}
     cells = []
@@ -139,7 +139,8 @@ def row(name: str, chips: Sequence[str]) -> list[str]:
             reach(np.array([readout.channel_values(r) - empty for r in some]), least)
             for some in readings.values()
         ]
-        cells.append(" / ".join(shown(*f) for f in far))
+        told = [shown(*f) for f in far]
+        cells.append("–" if set(told) == {"–"} else "/".join(told))
     return cells
 
 
@@ -149,7 +150,7 @@ def main() -> None:
     parser.add_argument("--chips", nargs="+", default=tuple(CHIPS), choices=CHIPS)
     parser.add_argument("--write", type=Path, metavar="PAGE", help="a page with marks of the table")
     options = parser.parse_args()
-    lines = [f"| {' | '.join(['hand / ball [mm]', *(f'`{c}`' for c in options.chips)])} |"]
+    lines = [f"| {' | '.join(['hand/ball [mm]', *(f'`{c}`' for c in options.chips)])} |"]
     lines.append("|---" * (1 + len(options.chips)) + "|")
     print("\n".join(lines), flush=True)
     for name in options.designs:

@@ -1,4 +1,4 @@
-"""The page on the server: its snippets run against one."""
+"""The page on the server: its snippets, and the client for browsers, run against one."""
 
 from __future__ import annotations
 
@@ -14,20 +14,26 @@ from running_server import WAIT, RunningServer
 from capsense.server.options import Limits
 
 PAGE = (Path(__file__).parents[3] / "docs" / "server.md").read_text(encoding="utf-8")
+SCRIPT = Path(__file__).parents[3] / "examples" / "browser_client.js"
 URL = "ws://127.0.0.1:8765"
 
 
-def snippet(language: str, server: RunningServer, number: int = 0) -> str:
-    """A piece of the page's code in a language, for this server."""
-    code: str = re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)[number]
+def at(server: RunningServer, code: str) -> str:
+    """Code for this server."""
     assert code.count(URL) == 1
     return code.replace(URL, server.url)
+
+
+def snippet(server: RunningServer, number: int = 0) -> str:
+    """A piece of the page's Python, for this server."""
+    codes: list[str] = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+    return at(server, codes[number])
 
 
 def test_python(served: RunningServer) -> None:
     """It runs, and the last reading is that of a ball to the right."""
     scope: dict = {}
-    exec(snippet("python", served), scope)
+    exec(snippet(served), scope)
     own = scope["reading"].delta.diagonal()
     assert (own > 0).all()
     assert np.argmax(own) in (2, 5)
@@ -36,7 +42,7 @@ def test_python(served: RunningServer) -> None:
 def test_hands(served: RunningServer) -> None:
     """The hand of the page is over the sensor."""
     scope: dict = {}
-    exec(snippet("python", served, 1), scope)
+    exec(snippet(served, 1), scope)
     assert scope["reading"].delta.diagonal().min() > 5e-15
 
 
@@ -46,7 +52,7 @@ def test_javascript(served: RunningServer, tmp_path: Path) -> None:
     if node is None:
         pytest.skip("needs node, version 20 or later")
     program = tmp_path / "page.js"
-    program.write_text(snippet("javascript", served), encoding="utf-8")
+    program.write_text(at(served, SCRIPT.read_text(encoding="utf-8")), encoding="utf-8")
     command = [node, "--experimental-websocket", str(program)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT)
     if "WebSocket is not defined" in done.stderr or "bad option" in done.stderr:
