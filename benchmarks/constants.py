@@ -115,10 +115,9 @@ def summary() -> str:
     known = notes()
     origins = Counter(str(known[c.key]["origin"]) for c in tuned())
     kinds = Counter(str(known[c.key]["kind"]) for c in constants())
-    rows = [[f"*{name}*: {text}", str(origins[name])] for name, text in ORIGINS.items()]
-    rows += [[f"not tuned: {text}", str(kinds[name])] for name, text in OTHERS.items()]
-    count = f"**{origins.total()} constants are tuned.**"
-    return f"{count}\n\n{markdown_table(('origin', 'number'), rows)}"
+    chosen = "; ".join(f"{origins[name]} {text} (*{name}*)" for name, text in ORIGINS.items())
+    others = ", ".join(f"{kinds[name]} {text}" for name, text in OTHERS.items())
+    return f"**{origins.total()} constants are tuned**: {chosen}. Not tuned: {others}."
 
 
 OTHERS = {
@@ -129,10 +128,10 @@ OTHERS = {
 }
 """Kinds that are not tuned, in words."""
 ORIGINS = {
-    "formula": "follows from an ideal case, such as a half-space",
-    "reference": "set or checked by comparison with reference solutions",
-    "margin": "a bound that is not reached in regular scenes",
-    "choice": "a resolution or range; how it was found is not recorded",
+    "formula": "follow from an ideal case",
+    "reference": "were set or checked by reference solutions",
+    "margin": "are bounds that regular scenes do not reach",
+    "choice": "are choices of resolution or range, without a record of how they were found",
 }
 """Origins of tuned ones, in words."""
 
