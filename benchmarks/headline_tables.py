@@ -181,20 +181,15 @@ def steps(figures: Figures) -> str:
 def rates(figures: Figures) -> str:
     """Batches, fleets and skins."""
     part, fleet, skin = (_Part(figures, name) for name in ("steps", "fleet", "skin"))
+    batch = "/".join(_rounded(part, f"batch/{name}") for name in PRESETS)
+    solves = "/".join(_rounded(fleet, f"{name}/4096") for name in PRESETS[:2])
+    threads = "/".join(name.rpartition("/")[2] for name in skin.found)
     rows = [
-        [f"256 random scenes of one body, two threads, {quoted}",
-         f"{_rounded(part, f'batch/{name}')} scenes a second"]
-        for name, quoted in zip(PRESETS, QUOTED, strict=True)
+        ["256 random scenes of one body, two threads", f"{batch} scenes a second"],
+        ["fleet of 4,096 environments, a finger in each", f"{solves} solves a second"],
+        [f"sixteen curved sensors around an arm beside a hand, {threads} threads",
+         f"{skin.row(list(skin.found))} ms a step"],
     ]  # fmt: skip
-    rows += [
-        [f"fleet of 4,096 environments, a finger in each, {quoted}",
-         f"{_rounded(fleet, f'{name}/4096')} solves a second"]
-        for name, quoted in zip(PRESETS[:2], QUOTED, strict=False)
-    ]  # fmt: skip
-    for name in skin.found:
-        threads = name.rpartition("/")[2]
-        label = f"sixteen curved sensors around an arm beside a hand, threads: {threads}"
-        rows.append([label, f"{skin.text(name, '.1f')} ms a step"])
     sources = "\n".join(p.source() for p in (part, fleet, skin))
     return f"{table(('', 'wall-clock time'), rows)}\n\n{sources}"
 
