@@ -206,16 +206,16 @@ HEAD = ("rms", "95 % below", "worst", "others: rms", "worst")
 
 
 def presets(names: Sequence[str] = PRESETS) -> str:
-    """Errors of each preset over the two maps."""
+    """Errors of each preset over the two maps, those of the presets beside each other."""
     far = [c for c in reference_scenes(MORE) if c.gap > limits.NEAR]
     near = [c for c in reference_scenes(MORE) if c.gap <= limits.NEAR]
     groups = (("map, 5 to 100 mm", reference_scenes(MAP)), ("more, from 5 mm on", far),
               ("more, 0.5 to 2 mm", near))  # fmt: skip
     lines = []
     for title, cases in groups:
-        for name in names:
-            lines.append((title, name, len(cases), *figures_of(map_rows(name, cases))))
-    return table(("scenes", "preset", "number", *HEAD), lines)
+        found = [figures_of(map_rows(name, cases)) for name in names]
+        lines.append((title, len(cases), *map("/".join, zip(*found, strict=True))))
+    return table(("scenes", "number", *HEAD), lines)
 
 
 def designs(only: str = "") -> str:
