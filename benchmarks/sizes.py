@@ -16,6 +16,7 @@ import tokenize
 from collections import defaultdict
 from pathlib import Path
 
+from headline_tables import table as markdown_table
 from pages import write_between
 
 ROOT = Path(__file__).parents[1]
@@ -79,7 +80,7 @@ def purpose(package: str) -> str:
 def table(now: dict[str, tuple[int, int]], before: dict[str, tuple[int, int]] | None) -> str:
     """The table in Markdown."""
     columns = ["package", "lines of code", *(["before"] if before else []), "purpose"]
-    rows = [columns, ["---"] * len(columns)]
+    rows = []
     for name in sorted({*now, *(before or {})}, key=lambda n: (n == ".", n)):
         modules, lines = now.get(name, (0, 0))
         old = [f"{before.get(name, (0, 0))[1]:,}"] if before else []
@@ -88,7 +89,7 @@ def table(now: dict[str, tuple[int, int]], before: dict[str, tuple[int, int]] | 
     total = sum(lines for _, lines in now.values())
     old = [f"{sum(lines for _, lines in before.values()):,}"] if before else []
     rows.append(["**all**", f"{total:,}", *old, ""])
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    return markdown_table(columns, rows)
 
 
 def main() -> None:

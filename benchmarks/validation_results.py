@@ -6,6 +6,8 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from headline_tables import table as markdown_table
+
 from capsense.reproduce import STUDIES
 
 SMOOTHNESS = "python benchmarks/smoothness.py -o out/smoothness.json"
@@ -14,8 +16,7 @@ Cells = Sequence[object]
 
 def table(header: Cells, lines: Sequence[Cells]) -> str:
     """A table in Markdown."""
-    rows = [header, ["---"] * len(header), *lines]
-    return "\n".join(f"| {' | '.join(str(c) for c in row)} |" for row in rows)
+    return markdown_table([str(c) for c in header], [[str(c) for c in line] for line in lines])
 
 
 def smoothness(path: Path) -> str:
