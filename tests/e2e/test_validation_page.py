@@ -156,6 +156,20 @@ def test_what_was_not_run_is_said(parts: dict[str, ModuleType], tmp_path: Path) 
         assert f"| {name} | not run in this edition: `capsense reproduce {name}` |" in found
 
 
+def test_smoothness(parts: dict[str, ModuleType], tmp_path: Path) -> None:
+    """The largest value of all bodies, with its body; counts are sums."""
+    even = {"approach": 1e-5, "slide": 2e-5, "turn z": 0.0, "turn y": 0.0, "wall": 3e-4,
+            "contact": [0.01, 0.02], "falls": [0, 1], "wrong": [1, 0], "memory": 0.0}  # fmt: skip
+    rough = {**even, "turn y": 5e-5, "wall": 1e-4, "contact": [0.04, 0.0], "memory": 1e-9}
+    path = tmp_path / "smoothness.json"
+    path.write_text(json.dumps({"preset": {"ball": even, "box": rough}}), encoding="utf-8")
+    found = [cells(line)[1:] for line in parts["validation_results"].smoothness(path).splitlines()]
+    assert found[2:] == [
+        ["5.0e-05", "box"], ["3.0e-04", "ball"], ["4.00", "box"], ["2", ""], ["2", ""],
+        ["1e-09", ""],
+    ]  # fmt: skip
+
+
 def test_rows_of_a_study(parts: dict[str, ModuleType], tmp_path: Path) -> None:
     studies = parts["validation_results"].studies
     name = next(iter(STUDIES))
