@@ -1,7 +1,7 @@
-"""The numerical constants of the solver, from its source, and the table of them in the docs.
+"""The numerical constants of the solver, from its source, and their number in the docs.
 
     python benchmarks/constants.py                              # print the table
-    python benchmarks/constants.py --write docs/theory.md       # replace the one of a page
+    python benchmarks/constants.py --write docs/theory.md       # replace the summary of a page
     python benchmarks/constants.py --literals                   # numbers inside functions
 
 Listed are the module-level names in capitals that hold numbers, or tuples of numbers, and the
@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from headline_tables import table as markdown_table
 from pages import write_between
 
 HERE = Path(__file__).resolve().parent
@@ -90,25 +91,33 @@ def notes() -> dict[str, dict[str, Any]]:
     return tomllib.loads(NOTES.read_text(encoding="utf-8"))
 
 
+def tuned() -> list[Constant]:
+    """Those that were chosen."""
+    known = notes()
+    return [c for c in constants() if known[c.key]["kind"] == "tuned"]
+
+
 def table() -> str:
-    """The table of the tuned constants, in Markdown, and a count of the others."""
-    known, found = notes(), constants()
-    lines = [
-        "| constant, where | value | unit, or ratio to | meaning | origin, sensitivity |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    kinds = Counter(str(known[c.key]["kind"]) for c in found)
-    for c in found:
+    """The table of the tuned constants, in Markdown."""
+    known = notes()
+    rows = []
+    for c in tuned():
         note = known[c.key]
-        if note["kind"] == "tuned":
-            unit = "–" if note["unit"] == "1" else note["unit"]
-            first = f"`{c.name}`<br>`{c.module}`", c.value, unit
-            origin = "; ".join(filter(None, (note["origin"], note.get("sensitivity"))))
-            row = *first, note["meaning"], origin
-            lines.append("| " + " | ".join(row) + " |")
-    others = ", ".join(f"{kinds[k]} {name}" for k, name in OTHERS.items())
-    count = f"**{kinds['tuned']} constants are tuned.** Not in the table: {others}."
-    return "\n".join([count, "", '<div class="constants" markdown>', "", *lines, "", "</div>"])
+        unit = "–" if note["unit"] == "1" else note["unit"]
+        origin = "; ".join(filter(None, (note["origin"], note.get("sensitivity"))))
+        rows.append([f"`{c.module}.{c.name}`", c.value, unit, note["meaning"], origin])
+    head = ("constant", "value", "unit, or ratio to", "meaning", "origin, sensitivity")
+    return markdown_table(head, rows)
+
+
+def summary() -> str:
+    """How many constants there are, by origin or kind."""
+    known = notes()
+    origins = Counter(str(known[c.key]["origin"]) for c in tuned())
+    kinds = Counter(str(known[c.key]["kind"]) for c in constants())
+    chosen = "; ".join(f"{origins[name]} {text} (*{name}*)" for name, text in ORIGINS.items())
+    others = ", ".join(f"{kinds[name]} {text}" for name, text in OTHERS.items())
+    return f"**{origins.total()} constants are tuned**: {chosen}. Not tuned: {others}."
 
 
 OTHERS = {
@@ -118,7 +127,13 @@ OTHERS = {
     "exact": "exact numbers of formulas",
 }
 """Kinds that are not tuned, in words."""
-ORIGINS = "formula", "reference", "margin", "choice"
+ORIGINS = {
+    "formula": "follow from an ideal case",
+    "reference": "were set or checked by reference solutions",
+    "margin": "are bounds that regular scenes do not reach",
+    "choice": "are choices of resolution or range, without a record of how they were found",
+}
+"""Origins of tuned ones, in words."""
 
 
 def _of_body(module: str, body: list[ast.stmt], wanted: Any) -> Iterator[Constant]:
@@ -200,9 +215,9 @@ def _shown(node: ast.expr) -> str:
 
 
 def main() -> None:
-    """Print the table, write it into a page, or print the count of other numbers."""
+    """Print the table, write the summary into a page, or print the count of other numbers."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--write", type=Path, metavar="PAGE", help="page to put the table into")
+    parser.add_argument("--write", type=Path, metavar="PAGE", help="page to put the summary into")
     parser.add_argument("--literals", action="store_true", help="count numbers inside functions")
     given = parser.parse_args()
     if given.literals:
@@ -212,7 +227,7 @@ def main() -> None:
     elif given.write is None:
         print(table())
     else:
-        write_between(given.write, (START, END), table())
+        write_between(given.write, (START, END), summary())
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Point clouds as bodies: agreement with the plain shapes, times.
 
-``python benchmarks/point_clouds.py`` prints the table of ``docs/from_the_paper.md``. Times are of
-this machine, one process, as found.
+``python benchmarks/point_clouds.py`` prints what ``docs/from_the_paper.md`` tells of point clouds.
+Times are of this machine, one process, as found.
 """
 
 from __future__ import annotations

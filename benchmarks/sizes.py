@@ -16,6 +16,7 @@ import tokenize
 from collections import defaultdict
 from pathlib import Path
 
+from headline_tables import table as markdown_table
 from pages import write_between
 
 ROOT = Path(__file__).parents[1]
@@ -78,17 +79,17 @@ def purpose(package: str) -> str:
 
 def table(now: dict[str, tuple[int, int]], before: dict[str, tuple[int, int]] | None) -> str:
     """The table in Markdown."""
-    columns = ["package", "modules", "lines of code", *(["before"] if before else []), "purpose"]
-    rows = [columns, ["---"] * len(columns)]
+    columns = ["package", "lines of code", *(["before"] if before else []), "purpose"]
+    rows = []
     for name in sorted({*now, *(before or {})}, key=lambda n: (n == ".", n)):
         modules, lines = now.get(name, (0, 0))
         old = [f"{before.get(name, (0, 0))[1]:,}"] if before else []
         label = "single modules" if name == "." else f"`{name}`"
-        rows.append([label, str(modules), f"{lines:,}", *old, purpose(name) if modules else "gone"])
-    totals = [sum(column) for column in zip(*now.values(), strict=True)]
+        rows.append([label, f"{lines:,}", *old, purpose(name) if modules else "gone"])
+    total = sum(lines for _, lines in now.values())
     old = [f"{sum(lines for _, lines in before.values()):,}"] if before else []
-    rows.append(["**all**", str(totals[0]), f"{totals[1]:,}", *old, ""])
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    rows.append(["**all**", f"{total:,}", *old, ""])
+    return markdown_table(columns, rows)
 
 
 def main() -> None:

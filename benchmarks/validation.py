@@ -169,13 +169,13 @@ def errors_of_references() -> dict[tuple[str, str], dict[str, Apart]]:
 
 
 def references() -> str:
-    """The same as a table, a line a body."""
+    """The largest of them as a table, a line a body."""
     lines = []
     for (design, body), cases in errors_of_references().items():
-        diagonal = ", ".join(f"{100 * errors[0]:.1f}" for errors in cases.values())
+        diagonal = f"{100 * max(errors[0] for errors in cases.values()):.1f}"
         others = [100 * e for _, e in cases.values() if not math.isnan(e)]
         worst = f"{max(others):.1f}" if others else "–"
-        lines.append((design, body, ", ".join(cases), diagonal, worst))
+        lines.append((design, body, len(cases), diagonal, worst))
     return table(("design", "body", "cases", "diagonal, %", "others, worst"), lines)
 
 
@@ -196,35 +196,55 @@ def map_rows(preset: str, cases: Sequence[ReferenceScene]) -> list[dict[str, Any
 
 
 def figures_of(rows: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Errors of the diagonal (rms, 95 %, worst, mean) and of the other entries (rms, worst), %."""
+    """Errors of the diagonal (rms, 95 %, worst) and of the other entries (rms, worst), %."""
     s = accuracy_map.summary(rows)
-    keys = ("rms", "p95", "worst", "mean", "others_rms", "others_worst")
-    return tuple(f"{s[k]:+.2f}" if k == "mean" else f"{s[k]:.2f}" for k in keys)
+    keys = ("rms", "p95", "worst", "others_rms", "others_worst")
+    return tuple(f"{s[k]:.2f}" for k in keys)
 
 
-HEAD = ("rms", "95 % below", "worst", "mean", "others: rms", "worst")
+HEAD = ("rms", "95 % below", "worst", "others: rms", "worst")
 
 
 def presets(names: Sequence[str] = PRESETS) -> str:
-    """Errors of each preset over the two maps."""
+    """Errors of each preset over the two maps, those of the presets beside each other."""
     far = [c for c in reference_scenes(MORE) if c.gap > limits.NEAR]
     near = [c for c in reference_scenes(MORE) if c.gap <= limits.NEAR]
     groups = (("map, 5 to 100 mm", reference_scenes(MAP)), ("more, from 5 mm on", far),
               ("more, 0.5 to 2 mm", near))  # fmt: skip
     lines = []
     for title, cases in groups:
-        for name in names:
-            lines.append((title, name, len(cases), *figures_of(map_rows(name, cases))))
-    return table(("scenes", "preset", "number", *HEAD), lines)
+        found = [figures_of(map_rows(name, cases)) for name in names]
+        lines.append((title, len(cases), *map("/".join, zip(*found, strict=True))))
+    return table(("scenes", "number", *HEAD), lines)
 
 
 def designs(only: str = "") -> str:
-    """Errors over guarded pads and a pair of pads, of cases with ``only`` in their names."""
-    lines = []
+    """Errors over guarded pads and a pair of pads, of cases with ``only`` in their names.
+
+    A line a design, with the cases beside each other.
+    """
+    found: dict[str, list[Cells]] = {}
     for case in reference_designs.compared("surface", only):
+        design, _, body = case["name"].partition(", ")
+        if body.startswith("3 mm cover"):
+            design, body = f"{design}, 3 mm cover", body.partition(", ")[2]
         cells = ["–" if np.isnan(t) else f"{100 * (g / t - 1):+.2f}" for t, g in case["pairs"]]
-        lines.append((case["name"], *cells, f"{100 * case['error']:.2f}"))
-    head = ("case", "pad, shields at ground", "mutual", "self, shields driven", "reference")
+        place = body.partition(" at ")[2].removesuffix(" mm")
+        found.setdefault(design, []).append((place, *cells, f"{100 * case['error']:.2f}"))
+    lines = []
+    for design, cases in found.items():
+        columns = (
+            list(dict.fromkeys(c)) if set(c) == {"–"} else c for c in zip(*cases, strict=True)
+        )
+        lines.append((design, *(", ".join(map(str, c)) for c in columns)))
+    head = (
+        "design",
+        "gap, mm",
+        "pad, shields at ground",
+        "mutual",
+        "self, shields driven",
+        "reference",
+    )
     return table(head, lines)
 
 
@@ -233,6 +253,27 @@ def limited(part: str, *columns: str, lines: int | None = None) -> str:
     found = islice(getattr(limits, part)(cs.Simulator(limits.DESIGN)), lines)
     cells = [(name, *(f"{100 * e:.1f}" for e in errors)) for name, errors in found]
     return table(("", *columns), cells)
+
+
+def wide(lines: int | None = None) -> str:
+    """Wide boxes: median, worst and told errors of each preset, in per cent."""
+    found = islice(limits.wide(cs.Simulator(limits.DESIGN)), lines)
+    cells = [
+        (name, *(", ".join(f"{100 * e:.1f}" for e in errors[3 * k : 3 * k + 3]) for k in range(3)))
+        for name, errors in found
+    ]
+    return table(("", *PRESETS), cells)
+
+
+def inside() -> str:
+    """What ``solver_error`` tells of bodies in the sensor, in a sentence."""
+    told = {name: errors for name, errors in limits.inside(cs.Simulator(limits.DESIGN))}
+    least = 100 * min(errors[-1] for errors in told.values())
+    unnoticed = [name for name, errors in told.items() if errors[-2] < 0.1]
+    return (
+        f"5 mm below the face `solver_error` is {least:.0f} % of the largest entry or more. "
+        f"1 mm below, it does not tell of: {', '.join(unnoticed) or 'none'}."
+    )
 
 
 def machine() -> str:
@@ -288,9 +329,9 @@ def main() -> None:
         command=COMMAND, machine=machine(), analytic=analytic(), presets=presets(),
         references=references(), designs=designs(),
         smoothness=smoothness(out / "smoothness.json"),
-        wide=limited("wide", *(f"{p}: {x}" for p in PRESETS for x in ("median", "worst", "told"))),
+        wide=wide(),
         images=limited("images", *GAPS),
-        inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),
+        inside=inside(),
         studies=studies(reproduced), foretold=foretold(),
     )  # fmt: skip
     args.output.write_text(page, encoding="utf-8")

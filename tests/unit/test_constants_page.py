@@ -1,4 +1,4 @@
-"""The page on the theory lists the constants that the code has, with their values."""
+"""The constants of the solver: each is described, and the page on the theory counts them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "benchmarks"))
 
 import constants  # noqa: E402
+import pages  # noqa: E402
 
 PAGE = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
 UPDATE = "run python benchmarks/constants.py --write docs/theory.md"
@@ -29,15 +30,27 @@ def test_every_constant_is_described() -> None:
             assert note["kind"] in constants.OTHERS, key
 
 
-def test_the_page_lists_them() -> None:
-    """Name, module and value of every tuned constant, no others, and their number."""
-    text = PAGE.partition(constants.START)[2].partition(constants.END)[0]
-    rows = re.findall(r"^\| `([\w.]+)`<br>`([\w.]+)` \| (.*?) \|", text, re.MULTILINE)
+def test_the_table_lists_the_tuned_ones() -> None:
+    """Name, value, unit and meaning of every one, and no others."""
+    rows = re.findall(
+        r"^\| `([\w.]+)` \| (.*?) \| (.+?) \| (.+?) \|", constants.table(), re.MULTILINE
+    )
     notes = constants.notes()
     tuned = [c for c in constants.constants() if notes[c.key]["kind"] == "tuned"]
-    assert rows == [(c.name, c.module, c.value) for c in tuned], UPDATE
-    assert f"**{len(rows)} constants are tuned.**" in text, UPDATE
-    assert text.strip() == constants.table(), UPDATE
+    assert [row[:2] for row in rows] == [(c.key, c.value) for c in tuned]
+    assert [row[3] for row in rows] == [notes[c.key]["meaning"] for c in tuned]
+
+
+def test_the_page_counts_them() -> None:
+    """By origin, and those that are not tuned by kind."""
+    text = pages.between(PAGE, (constants.START, constants.END))
+    assert text == constants.summary(), UPDATE
+    notes = list(constants.notes().values())
+    for words, kind, key in (
+        *((words, kind, "kind") for kind, words in constants.OTHERS.items()),
+        *((words, origin, "origin") for origin, words in constants.ORIGINS.items()),
+    ):
+        assert f" {sum(note.get(key) == kind for note in notes)} {words}" in text
 
 
 def test_what_counts_as_a_constant(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
