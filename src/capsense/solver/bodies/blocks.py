@@ -200,11 +200,12 @@ def _packed(panels: SurfacePanels) -> _Packed:
     trace = np.einsum("naa->n", panels.moments)
     spread = 2 * np.einsum("nab,nab->n", panels.moments, panels.moments) - trace**2
     flat[9] = np.sqrt(1.5 * (trace + np.sqrt(np.maximum(spread, 0.0))))
-    c = panels.corners
-    return _Packed(
-        flat, edges_of(panels), np.ascontiguousarray(panels.normals), panels.areas,
-        _points(c, 3), _points(c, 4, _BEND), _rim(c),
-    )  # fmt: skip
+    n = len(panels)
+    coarse, fine, rim = np.empty((n, 9, 4)), np.empty((n, 16, 4)), np.empty((n, 12, 4))
+    lines = _line(3, 0.0), _line(4, _BEND), _line(6, 1.0)
+    kernels.fill_points(panels.corners, lines, (coarse, fine, rim))
+    normals = np.ascontiguousarray(panels.normals)
+    return _Packed(flat, edges_of(panels), normals, panels.areas, coarse, fine, rim)
 
 
 def edges_of(panels: SurfacePanels) -> Array:
@@ -218,41 +219,3 @@ def _line(order: int, bend: float) -> tuple[Array, Array]:
     t, w = np.polynomial.legendre.leggauss(order)
     t, w = 0.5 * (t + 1), 0.5 * w
     return t + bend * (3 * t**2 - 2 * t**3 - t), w * (1 + bend * (6 * t * (1 - t) - 1))
-
-
-def _points(corners: Array, order: int, bend: float = 0.0) -> Array:
-    """Points on polygons and weights that sum to one, shape (n, order², 4)."""
-    line, along = _line(order, bend)
-    s, t = (x.ravel() for x in np.meshgrid(line, line))
-    weight = np.outer(along, along).ravel()
-    a, b, c, d = np.moveaxis(corners, 1, 0)
-    # the Jacobian of a bilinear map of a plane polygon is linear in s and t
-    sides = ((b - a, d - a), (b - a, c - b), (c - d, d - a))
-    at = [np.linalg.norm(np.cross(p, q), axis=1)[:, None] for p, q in sides]
-    jacobian = at[0] + s * (at[1] - at[0]) + t * (at[2] - at[0])
-    out = np.empty((len(corners), len(s), 4))
-    shape = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], axis=1)
-    out[..., :3] = shape @ corners
-    out[..., 3] = weight * jacobian
-    out[..., 3] /= out[..., 3].sum(axis=1, keepdims=True)
-    return out
-
-
-def _rim(corners: Array) -> Array:
-    """Points and weights whose mean potential is the mean over the panel of its own potential.
-
-    The energy of an evenly charged polygon goes with the third power of its size, so it is two
-    thirds of the sum over edges of their distance from a corner times the integral of the
-    potential along them. Two edges meet at that corner and drop out. Shape (n, 12, 4).
-    """
-    line, along = _line(6, 1.0)
-    out = np.empty((len(corners), 2, len(line), 4))
-    origin = corners[:, 0]
-    for k in (1, 2):
-        start, way = corners[:, k], corners[:, k + 1] - corners[:, k]
-        out[:, k - 1, :, :3] = start[:, None] + line[:, None] * way[:, None]
-        double = np.linalg.norm(np.cross(start - origin, way), axis=1)
-        out[:, k - 1, :, 3] = double[:, None] * along
-    points = out.reshape(len(corners), -1, 4)
-    points[..., 3] *= 4 / 3 / points[..., 3].sum(axis=1, keepdims=True)
-    return points

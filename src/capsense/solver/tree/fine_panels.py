@@ -316,10 +316,13 @@ class FinePanelBody(DynamicBody):
         last = np.flatnonzero(number >= 0)
         # of rectangles: these stand badly for larger clusters, which may be bent or have limbs
         near = means_between(self._points[last])
-        self._means = tree_kernels.means_of_clusters(near, last, children, self._charge)
+        count = len(children)
+        room = np.empty((count, len(last)), np.float32)
+        self._means = np.empty(count * (count + 1) // 2, np.float32)  # large: in large pages
+        tree_kernels.means_of_clusters(near, last, children, self._charge, room, self._means)
         """Means of 1/r within the body's first clusters, row by row up to the diagonal [1/m]."""
         self.record["inside"] = HALF_SPACE
-        self.record["means"], self.record["top"] = self._means.ctypes.data, len(children)
+        self.record["means"], self.record["top"] = self._means.ctypes.data, count
 
     @property
     def nbytes(self) -> int:
