@@ -280,10 +280,30 @@ def _kept(
         made.__dict__["_outline"] = whole  # which the record points to
         with _LOCK:
             found = _SHAPES[key] = _IN_USE.setdefault(key, made)
-            while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
-                _SHAPES.popitem(last=False)
+            _forget(made.nbytes)
     shape.__dict__[f"{slot} {count}"] = cast(T, found), size
     return cast(T, found), size
+
+
+_added = 0
+"""Room of the shapes that came since all were last counted [bytes]."""
+
+
+def _forget(more: int) -> None:
+    """Let the longest unused shapes go where all take up too much room.
+
+    They are counted when new ones have taken up a hundredth of it: impedances come later.
+
+    Args:
+        more: Room that a new one takes [bytes].
+    """
+    global _added
+    _added += more
+    if _added < _KEPT // 100:
+        return
+    _added, total = 0, sum(s.nbytes for s in _SHAPES.values())
+    while len(_SHAPES) > 1 and total > _KEPT:
+        total -= _SHAPES.popitem(last=False)[1].nbytes
 
 
 def _form(shape: Shape, count: int) -> tuple[float, tuple[Hashable, ...], Shape]:

@@ -50,7 +50,7 @@ class RefinedShape(RigidShape):
 
     @cached_property
     def _parts(self) -> dict[str, NDArray[Any]]:
-        return _with_parts(self)
+        return _with_parts(self, *_flat(self.panels))
 
     @cached_property
     def record(self) -> np.void:
@@ -80,9 +80,10 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
         finest: Parts with a side longer than this are halved [m].
         surface: The surface that its panels approximate.
     """
-    if _longest(_flat(shape.panels)[0]) <= finest:
+    flat = _flat(shape.panels)
+    if _longest(flat[0]) <= finest:
         return shape
-    return RefinedShape(
+    out = RefinedShape(
         shape.panels,
         shape.tree,
         shape.potential_coefficients,
@@ -91,6 +92,8 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
         finest,
         surface,
     )
+    out.__dict__["_parts"] = _with_parts(out, *flat)
+    return out
 
 
 def _flat(panels: SurfacePanels) -> tuple[Array, Array]:
@@ -247,10 +250,14 @@ def _fill_parts(parts: Any, planes: Any, surface: tuple[int, Array], out: Any) -
             center[c, d] = 0.25 * (four[0, d] + four[1, d] + four[2, d] + four[3, d])
 
 
-def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
-    """What a record points to of a shape's clusters and, behind them, of its panels' parts."""
+def _with_parts(shape: RefinedShape, flat: Array, axes: Array) -> dict[str, NDArray[Any]]:
+    """What a record points to of a shape's clusters and, behind them, of its panels' parts.
+
+    Args:
+        shape: The shape.
+        flat, axes: Its panels as :func:`_flat` gives them.
+    """
     panels, tree, m = shape.panels, shape.tree, len(shape.panels)
-    flat, axes = _flat(panels)
     corners, children, panel = halved(flat, shape.finest)
     single = np.flatnonzero(tree.panel >= 0)
     place = np.empty(m, np.int64)  # clusters of panels
