@@ -179,8 +179,8 @@ def fill_free(panels, mirrors, out):
 
 
 @kernel
-def fill_flux(panels, out):
-    """Write the flux block: flux through panel k from unit charge spread evenly on panel l.
+def fill_flux(panels, rows, out):
+    """Write rows of the flux block: flux through panel k from unit charge spread evenly on panel l.
 
     The flux from a point is the solid angle under which it sees the panel, so that the fluxes
     through a closed surface add up to 2π for every point on it. Near pairs average that over
@@ -189,7 +189,8 @@ def fill_flux(panels, out):
     flat, edges, normals, areas = panels.flat, panels.edges, panels.normals, panels.areas
     coarse, fine = panels.coarse, panels.fine
     n = areas.shape[0]
-    for k in range(n):
+    for place in range(rows.shape[0]):
+        k, line = rows[place], out[place]
         x0, y0, z0 = flat[0, k], flat[1, k], flat[2, k]
         xx, yy, zz = flat[3, k], flat[4, k], flat[5, k]
         xy, xz, yz = flat[6, k], flat[7, k], flat[8, k]
@@ -208,7 +209,7 @@ def fill_flux(panels, out):
             along = nx * x + ny * y + nz * z
             second = 7.5 * (mx * x + my * y + mz * z) / r2 - 1.5 * (axx + ayy + azz)
             value = along * (1.0 + second / r2) - 3.0 * (nx * mx + ny * my + nz * mz) / r2
-            out[k, j] = area * value / (r2 * math.sqrt(r2))
+            line[j] = area * value / (r2 * math.sqrt(r2))
         for j in range(n):
             x, y, z = x0 - flat[0, j], y0 - flat[1, j], z0 - flat[2, j]
             span = flat[9, k] + flat[9, j]
@@ -219,8 +220,8 @@ def fill_flux(panels, out):
                 for q in range(rule.shape[1]):
                     p = rule[j, q]
                     value -= p[3] * solid_angle(edges[k], normals[k], p[0], p[1], p[2])
-                out[k, j] = value
-        out[k, k] = 0.0
+                line[j] = value
+        line[k] = 0.0
 
 
 @kernel
