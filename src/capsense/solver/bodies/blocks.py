@@ -80,9 +80,9 @@ class _Patterns:
             self._by = np.zeros_like(first)
         self.firsts, self._number = np.unique(first, return_inverse=True)
         self._maps, self._image = image, image[:, self.firsts]
-        self._signs = np.ones((1, 1))  # of each kind, under each map
+        self._signs: Array = np.ones((1, 1))  # of each kind, under each map
         while len(self._signs) < len(image):
-            self._signs = np.kron([[1.0, 1.0], [1.0, -1.0]], self._signs)
+            self._signs = np.block([[self._signs, self._signs], [self._signs, -self._signs]])
         stays = self._image == self.firsts
         self._times = np.sqrt(stays.sum(axis=0))
         self._kinds = [np.flatnonzero(~stays[signs < 0.0].any(axis=0)) for signs in self._signs]
@@ -218,7 +218,7 @@ def _harmonics(panels: SurfacePanels) -> list[tuple[Array, Array]]:
 
 def _updated(z: list[Array], potential: list[Array], flux: list[Array]) -> list[Array]:
     """The Z nearest in kind that takes ``flux`` (n, m) to 4π ``potential``, all by patterns."""
-    energy = sum(u.T @ g for u, g in zip(potential, flux, strict=True))
+    energy: Array = np.sum([u.T @ g for u, g in zip(potential, flux, strict=True)], axis=0)
     energy = 0.5 * (energy + energy.T)
     inverse = np.linalg.pinv(energy, rcond=1e-9, hermitian=True)
     scaled = [u @ inverse for u in potential]
