@@ -285,7 +285,8 @@ def test_mirror_images(shape: Shape | None, maps: int) -> None:
 def test_impedance_by_kinds_of_patterns(apart: float) -> None:
     """Differential: the whole matrix at once. Parts that are each other's images stay apart."""
     corners = panels_of(Box((0.1, 0.08, 0.02)), 150).corners
-    both = np.concatenate([corners - [apart, 0.0, 0.0], corners + [apart, 0.0, 0.0]])
+    shift = np.array([apart, 0.0, 0.0])
+    both = np.concatenate([corners - shift, corners + shift])
     panels = polygon_panels(corners)
     if apart:
         panels = polygon_panels(both, np.repeat([0, 1], len(corners)))
