@@ -70,6 +70,7 @@ def _readings() -> None:
     ])  # fmt: skip
     simulator.step(pair, jacobian=True)
     simulator.step_batch([pair, cs.Scene([_body(0.05)])])
+    cs.Ellipsoid((0.02, 0.02, 0.03)).signed_distance([[0.0, 0.0, 0.1]])
 
 
 def _surfaces() -> None:

@@ -348,20 +348,9 @@ class Ellipsoid(_Primitive):
         of s = t + min r² no digits are lost. Coordinates are kept 1e-9 off the planes of
         symmetry, where the root is not simple.
         """
-        r = self.params
-        y = np.maximum(np.abs(as_points(points)), 1e-9 * r.min())
-        gap = r**2 - r.min() ** 2
-        s = (r * y - gap).max(axis=1, keepdims=True)
-        for _ in range(50):
-            ratio = (r * y / (s + gap)) ** 2
-            step = (ratio.sum(axis=1, keepdims=True) - 1) / (2 * ratio / (s + gap)).sum(
-                axis=1, keepdims=True
-            )
-            s = s + np.maximum(step, 0.0)
-            if np.all(step <= 1e-14 * s):
-                break
-        distance = np.linalg.norm(y - r**2 * y / (s + gap), axis=1)
-        return np.where(((y / r) ** 2).sum(axis=1) < 1.0, -distance, distance)
+        from capsense.scene.geometry_kernels import ellipsoid_distances
+
+        return ellipsoid_distances(np.ascontiguousarray(as_points(points)), self.params)
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh

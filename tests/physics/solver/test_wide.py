@@ -103,6 +103,36 @@ def test_metal_beside_a_wide_dielectric_counts(simulators, board, steel):
     assert np.abs(found - fine).max() < 0.04 * np.abs(fine).max()
 
 
+def test_panels_of_wide_meshes_are_kept_in_files(tmp_path, monkeypatch):
+    """Unit: another process reads what the first worked out, to the last bit; of what is damaged
+    they are found again."""
+    monkeypatch.setattr(store, "default_cache_dir", lambda: tmp_path)
+    made: list[int] = []
+    fresh = store.fine_tree_of_mesh
+    monkeypatch.setattr(
+        store, "fine_tree_of_mesh", lambda mesh, count: made.append(count) or fresh(mesh, count)
+    )
+    box = BLOCK.to_trimesh()
+
+    def anew() -> FinePanelBody:
+        store._SHAPES.clear()
+        store._IN_USE.clear()
+        body, _ = store.in_pieces(cs.TriMesh(box.vertices, box.faces), 5000, True)
+        assert isinstance(body, FinePanelBody)
+        return body
+
+    first, second = anew(), anew()
+    assert made == [5000]
+    truth = FinePanelBody(panels_of(cs.TriMesh(box.vertices, box.faces), 5000, merge=False), list)
+    for name in ("_children", "_charge", "_center", "_points", "_means", "weights"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+        np.testing.assert_array_equal(getattr(first, name), getattr(truth, name))
+    (file,) = (tmp_path / "shapes").glob("*-wide.npz")
+    file.write_bytes(b"damaged")
+    np.testing.assert_array_equal(anew().weights, first.weights)
+    assert made == [5000, 5000]
+
+
 def test_impedances_of_wide_meshes_are_kept_in_files(tmp_path, monkeypatch):
     """Unit: another process reads what the first worked out; what is damaged is made again."""
     monkeypatch.setattr(store, "default_cache_dir", lambda: tmp_path)

@@ -306,3 +306,16 @@ def test_meshes_of_more_parts_have_more_triangles(folder, monkeypatch, parts, wa
     with pytest.raises(KeyboardInterrupt):
         store._mesh_shape(TriMesh(mesh.vertices, mesh.faces), 100, f"row of {parts}")
     assert asked == [wanted]
+
+
+def test_the_longest_unused_shapes_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unit: when all of them take up too much room; a body that holds one keeps it."""
+    forget()
+    kept = [Capsule(0.01, 0.02 + 0.01 * k) for k in range(6)]
+    room = store.rigid(kept[0], 50)[0].nbytes
+    monkeypatch.setattr(store, "_KEPT", round(3.5 * room))
+    found = [store.rigid(shape, 50)[0] for shape in kept]
+    assert 2 <= len(store._SHAPES) <= 4
+    assert list(store._SHAPES.values()) == found[-len(store._SHAPES) :]
+    assert store.rigid(kept[0], 50)[0] is found[0]
+    assert store.rigid(Capsule(0.01, 0.02), 50)[0] is found[0]

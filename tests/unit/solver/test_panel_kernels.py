@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -278,6 +279,25 @@ def test_mirror_images(shape: Shape | None, maps: int) -> None:
     np.testing.assert_allclose(free, alone, rtol=2e-3)
     if maps == 1:
         np.testing.assert_array_equal(free, alone)
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.15], ids=["one box", "two boxes that are mirrored"])
+def test_impedance_by_kinds_of_patterns(apart: float) -> None:
+    """Differential: the whole matrix at once. Parts that are each other's images stay apart."""
+    corners = panels_of(Box((0.1, 0.08, 0.02)), 150).corners
+    shift = np.array([apart, 0.0, 0.0])
+    both = np.concatenate([corners - shift, corners + shift])
+    panels = polygon_panels(corners)
+    if apart:
+        panels = polygon_panels(both, np.repeat([0, 1], len(corners)))
+    n = np.arange(len(panels))
+    plain = replace(panels)
+    plain.__dict__["mirrors"] = Mirrors(n[None], n, np.zeros_like(n))
+    free = free_block(panels)
+    assert len(panels.mirrors.image) == 8
+    z, whole = impedance(panels, free), impedance(plain, free)
+    np.testing.assert_allclose(z, whole, rtol=0.0, atol=1e-9 * np.abs(whole).max())
+    np.testing.assert_allclose(z, z.T, rtol=0.0, atol=1e-12 * np.abs(z).max())
 
 
 def test_nearly_mirrored_panels_are_none() -> None:

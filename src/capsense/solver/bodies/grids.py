@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from capsense._jit import compiled, kernel
 
 Array = NDArray[np.float64]
 Profile = tuple[Array, Array, NDArray[np.int64]]
@@ -218,86 +219,101 @@ def _best_cell(size: float, count: int, panels: Callable[[float], int]) -> float
     return best[1]
 
 
+@compiled
 def ring_counts(rho: Array, step: Array, widest: float) -> NDArray[np.int64]:
     """Nodes on every ring of radius ``rho`` [m]: ``widest`` on the widest, halved towards poles.
 
     Neighbours have equal numbers or twice as many. ``step`` [m] is the height of the cells.
     """
     most = max(_LEAST, 4 * round(widest / 4))
-    least = 0.7 * np.minimum(step, 2 * math.pi * rho.max() / most)
-    out = np.empty(len(rho), dtype=np.int64)
-    middle = int(np.argmax(rho))
-    last = len(rho) - 1 - int(np.argmax(rho[::-1]))
+    count, largest = len(rho), rho.max()
+    out = np.empty(count, np.int64)
+    middle = last = int(np.argmax(rho))
+    for i in range(middle, count):
+        if rho[i] == largest:
+            last = i
     out[middle : last + 1] = most
-    for first, stop, way in ((middle - 1, -1, -1), (last + 1, len(rho), 1)):
+    for first, stop, way in ((middle - 1, -1, -1), (last + 1, count, 1)):
         nodes = most
         for i in range(first, stop, way):
             inner = i + way != stop
+            least = 0.7 * min(step[i], 2 * math.pi * largest / most)
             fewer = nodes % 2 == 0 and nodes // 2 >= _LEAST_INNER
-            if inner and fewer and 2 * math.pi * rho[i] / nodes < least[i]:
+            if inner and fewer and 2 * math.pi * rho[i] / nodes < least:
                 nodes //= 2
             out[i] = nodes if inner else 1
     return out
 
 
+@compiled
 def panel_count(nodes: NDArray[np.int64]) -> int:
     """How many panels :func:`revolve` makes."""
-    low, high = np.minimum(nodes[:-1], nodes[1:]), np.maximum(nodes[:-1], nodes[1:])
-    return int(np.where(low == high, low, np.where(low == 1, high, 3 * low)).sum())
+    out = 0
+    for k in range(len(nodes) - 1):
+        low, high = min(nodes[k], nodes[k + 1]), max(nodes[k], nodes[k + 1])
+        out += low if low == high else (high if low == 1 else 3 * low)
+    return out
 
 
+@compiled
 def revolve(rho: Array, z: Array, nodes: NDArray[np.int64]) -> Array:
     """Polygons between rings of nodes, corners of shape (n, 4, 3), counter-clockwise from outside.
 
     Trapezoids between rings of equal numbers, else triangles, which repeat their last corner.
     """
-    turn = 2 * math.pi * np.arange(nodes.max())
-    rings = []
-    for r, h, n in zip(rho.tolist(), z.tolist(), nodes.tolist(), strict=True):
-        ring = np.empty((n, 3))
-        t = turn[:n] / n
-        ring[:, 0], ring[:, 1], ring[:, 2] = r * np.cos(t), r * np.sin(t), h
-        rings.append(ring)
-    bands = []
-    for low, top in pairwise(rings):
-        few, many = (low, top) if len(low) <= len(top) else (top, low)
-        few_next, many_next = few[_next(len(few))], many[_next(len(many))]
-        if len(few) == len(many):
-            band = _quads(few, few_next, many_next, many)
-        elif len(few) == 1:
-            band = _quads(many, many_next, few, few)
+    out, at = np.empty((panel_count(nodes), 4, 3)), 0
+    rings = np.empty((2, nodes.max() + 1, 3))  # that of a band with fewer nodes first
+    for k in range(len(nodes) - 1):
+        less = 0 if nodes[k] <= nodes[k + 1] else 1
+        for side in range(2):
+            ring, n = rings[side], nodes[k + abs(side - less)]
+            radius, height = rho[k + abs(side - less)], z[k + abs(side - less)]
+            for i in range(n):
+                turn = 2 * math.pi * i / n
+                ring[i, 0], ring[i, 1] = radius * math.cos(turn), radius * math.sin(turn)
+                ring[i, 2] = height
+            ring[n] = ring[0]
+        few, many = rings[0], rings[1]
+        low, high = min(nodes[k], nodes[k + 1]), max(nodes[k], nodes[k + 1])
+        if low == high or low == 1:
+            for i in range(high):
+                a, b = (few[i], few[i + 1]) if low == high else (many[i], many[i + 1])
+                c, d = (many[i + 1], many[i]) if low == high else (few[0], few[0])
+                out[at, 0], out[at, 1], out[at, 2], out[at, 3] = a, b, c, d
+                at += 1
+            continue
+        for fan in range(3):
+            for i in range(low):
+                a = few[i] if fan < 2 else few[i + 1]
+                b = many[2 * i] if fan == 0 else many[2 * i + 1]
+                c = many[2 * i + 1] if fan == 0 else (few[i + 1] if fan == 1 else many[2 * i + 2])
+                out[at, 0], out[at, 1], out[at, 2], out[at, 3] = a, b, c, c
+                at += 1
+    for k in range(at):
+        _outwards(out[k])
+    return out
+
+
+@kernel
+def _outwards(corners: Array) -> None:
+    """Turn a polygon (4, 3) whose normal points to the origin; repeated corners stay last."""
+    along = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        normal = (corners[1, j] - corners[0, j]) * (corners[2, k] - corners[0, k])
+        normal -= (corners[1, k] - corners[0, k]) * (corners[2, j] - corners[0, j])
+        along += normal * (corners[0, i] + corners[1, i] + corners[2, i] + corners[3, i])
+    if along >= 0.0:
+        return
+    same = True
+    for i in range(3):
+        same = same and corners[2, i] == corners[3, i]
+    for i in range(3):
+        if same:
+            corners[0, i], corners[1, i] = corners[1, i], corners[0, i]
         else:
-            a, middle, b = many[::2], many[1::2], many_next[1::2]
-            fans = ((few, a, middle), (few, middle, few_next), (few_next, middle, b))
-            band = np.concatenate([_quads(p, q, r, r) for p, q, r in fans])
-        bands.append(band)
-    out = np.concatenate(bands)
-    normal = np.cross(out[:, 1] - out[:, 0], out[:, 2] - out[:, 0])
-    inward = np.einsum("ij,ij->i", normal, out.mean(axis=1)) < 0
-    out[inward] = _turned(out[inward])
-    return out
-
-
-def _next(n: int) -> NDArray[np.int64]:
-    """Numbers of the nodes that follow those of a ring, shape (n,)."""
-    out = np.arange(1, n + 1)
-    out[-1] = 0
-    return out
-
-
-def _quads(*corners: Array) -> Array:
-    """Polygons (n, 4, 3) of four corners each, shapes (n, 3) or (1, 3)."""
-    out = np.empty((len(corners[0]), 4, 3))
-    for k, corner in enumerate(corners):
-        out[:, k] = corner
-    return out
-
-
-def _turned(polygons: Array) -> Array:
-    """Polygons with the other winding, repeated corners last."""
-    triangle = (polygons[:, 2] == polygons[:, 3]).all(axis=1)
-    order = np.where(triangle[:, None], [1, 0, 2, 3], [3, 2, 1, 0])
-    return np.take_along_axis(polygons, order[:, :, None], axis=1)
+            corners[0, i], corners[3, i] = corners[3, i], corners[0, i]
+            corners[1, i], corners[2, i] = corners[2, i], corners[1, i]
 
 
 def _ring_factors(

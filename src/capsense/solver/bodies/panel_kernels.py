@@ -52,6 +52,81 @@ def _mean_potential(points, edges, normal):
 
 
 @kernel
+def fill_points(corners, lines, out):
+    """Fill in points on panels and their weights: for near and for touching pairs, and rims.
+
+    The mean over a panel of its own potential is found on its rim: the energy of an evenly charged
+    polygon goes with the third power of its size, so that it is two thirds of the sum over edges of
+    their distance from a corner times the integral of the potential along them. Two edges meet at
+    that corner and drop out.
+
+    Args:
+        corners: Of the panels [m], shape (n, 4, 3).
+        lines: Places on 0 ... 1 and weights, shapes (q,), three times: along both ways across a
+            panel, twice, and along an edge.
+        out: Filled: shapes (n, q², 4) twice, weights of a panel adding up to one, and (n, 2 q, 4).
+    """
+    coarse, fine, rim = out
+    for k in range(corners.shape[0]):
+        _across(corners[k], lines[0], coarse[k])
+        _across(corners[k], lines[1], fine[k])
+        _along(corners[k], lines[2], rim[k])
+
+
+@kernel
+def _across(corners, line, out):
+    """Fill in points on a polygon and weights that sum to one, shape (q², 4)."""
+    places, weights = line
+    count, total = places.shape[0], 0.0
+    # the Jacobian of a bilinear map of a plane polygon is linear in s and t
+    first = _double(corners, 0, 1, 0, 3)
+    along, up = _double(corners, 0, 1, 1, 2) - first, _double(corners, 3, 2, 0, 3) - first
+    for i in range(count):
+        for j in range(count):
+            s, t, o = places[j], places[i], i * count + j
+            a, b, c, d = (1.0 - s) * (1.0 - t), s * (1.0 - t), s * t, (1.0 - s) * t
+            for x in range(3):
+                out[o, x] = (
+                    a * corners[0, x] + b * corners[1, x] + c * corners[2, x] + d * corners[3, x]
+                )
+            out[o, 3] = weights[i] * weights[j] * (first + s * along + t * up)
+            total += out[o, 3]
+    for o in range(count * count):
+        out[o, 3] /= total
+
+
+@kernel
+def _along(corners, line, out):
+    """Fill in points on the two edges that do not meet at the first corner, shape (2 q, 4)."""
+    places, weights = line
+    count, total = places.shape[0], 0.0
+    for e in range(2):
+        double = _double(corners, 0, e + 1, e + 1, e + 2)
+        for i in range(count):
+            o = e * count + i
+            for x in range(3):
+                start = corners[e + 1, x]
+                out[o, x] = start + places[i] * (corners[e + 2, x] - start)
+            out[o, 3] = double * weights[i]
+            total += out[o, 3]
+    for o in range(2 * count):
+        out[o, 3] *= 4.0 / 3.0 / total
+
+
+@kernel
+def _double(corners, a, b, c, d):
+    """Area of the parallelogram of two ways, from corner a to b and from c to d [m²]."""
+    ux, uy, uz = (
+        corners[b, 0] - corners[a, 0], corners[b, 1] - corners[a, 1], corners[b, 2] - corners[a, 2],
+    )  # fmt: skip
+    vx, vy, vz = (
+        corners[d, 0] - corners[c, 0], corners[d, 1] - corners[c, 1], corners[d, 2] - corners[c, 2],
+    )  # fmt: skip
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@kernel
 def fill_free(panels, mirrors, out):
     """Write the free-space block: F_kl [1/m], mean over panel k of the potential of panel l.
 
@@ -104,8 +179,8 @@ def fill_free(panels, mirrors, out):
 
 
 @kernel
-def fill_flux(panels, out):
-    """Write the flux block: flux through panel k from unit charge spread evenly on panel l.
+def fill_flux(panels, rows, out):
+    """Write rows of the flux block: flux through panel k from unit charge spread evenly on panel l.
 
     The flux from a point is the solid angle under which it sees the panel, so that the fluxes
     through a closed surface add up to 2π for every point on it. Near pairs average that over
@@ -114,7 +189,8 @@ def fill_flux(panels, out):
     flat, edges, normals, areas = panels.flat, panels.edges, panels.normals, panels.areas
     coarse, fine = panels.coarse, panels.fine
     n = areas.shape[0]
-    for k in range(n):
+    for place in range(rows.shape[0]):
+        k, line = rows[place], out[place]
         x0, y0, z0 = flat[0, k], flat[1, k], flat[2, k]
         xx, yy, zz = flat[3, k], flat[4, k], flat[5, k]
         xy, xz, yz = flat[6, k], flat[7, k], flat[8, k]
@@ -133,7 +209,7 @@ def fill_flux(panels, out):
             along = nx * x + ny * y + nz * z
             second = 7.5 * (mx * x + my * y + mz * z) / r2 - 1.5 * (axx + ayy + azz)
             value = along * (1.0 + second / r2) - 3.0 * (nx * mx + ny * my + nz * mz) / r2
-            out[k, j] = area * value / (r2 * math.sqrt(r2))
+            line[j] = area * value / (r2 * math.sqrt(r2))
         for j in range(n):
             x, y, z = x0 - flat[0, j], y0 - flat[1, j], z0 - flat[2, j]
             span = flat[9, k] + flat[9, j]
@@ -144,8 +220,8 @@ def fill_flux(panels, out):
                 for q in range(rule.shape[1]):
                     p = rule[j, q]
                     value -= p[3] * solid_angle(edges[k], normals[k], p[0], p[1], p[2])
-                out[k, j] = value
-        out[k, k] = 0.0
+                line[j] = value
+        line[k] = 0.0
 
 
 @kernel

@@ -73,8 +73,10 @@ class SurfacePanels:
     def mirrors(self) -> Mirrors:
         """Mirror images of panels; there is the identity at least."""
         image = np.arange(len(self))[None]
+        own = np.round(self.centers / (_SAME * float(np.abs(self.corners).max())))
+        order = np.lexsort(own.T)
         for axis in range(3):
-            found = _mirrored(self, axis)
+            found = _mirrored(self.moments, own, order, axis)
             if found is not None:
                 image = np.concatenate([image, found[image]])
         return Mirrors(image, image.min(axis=0), image.argmin(axis=0))
@@ -176,20 +178,26 @@ def _cross(u: Array, v: Array) -> Array:
     return np.stack([u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2] for k in range(3)])
 
 
-def _mirrored(panels: SurfacePanels, axis: int) -> NDArray[np.int64] | None:
-    """The panels that the plane across an axis takes panels to, (n,), or None."""
+def _mirrored(
+    moments: Array, own: Array, order: NDArray[np.int64], axis: int
+) -> NDArray[np.int64] | None:
+    """The panels that the plane across an axis takes panels to, (n,), or None.
+
+    Args:
+        moments: Of the panels [m²], shape (n, 3, 3).
+        own: Their centres in whole numbers, shape (n, 3).
+        order: What sorts these, shape (n,).
+        axis: The axis.
+    """
     sign = np.ones(3)
     sign[axis] = -1.0
-    grain = _SAME * float(np.abs(panels.corners).max())
-    own = np.round(panels.centers / grain)
-    order, there = np.lexsort(own.T), np.lexsort((sign * own).T)
+    there = np.lexsort((sign * own).T)
     if not np.array_equal(own[order], sign * own[there]):
         return None
     out = np.empty_like(order)
     out[order] = there
-    moments = sign[:, None] * panels.moments[out] * sign
-    same = np.allclose(moments, panels.moments, rtol=0.0, atol=_SAME * panels.moments.max())
-    return out if same else None
+    off = np.abs(sign[:, None] * moments[out] * sign - moments).max()
+    return out if off <= _SAME * moments.max() else None
 
 
 def _lengths(shape: Shape) -> tuple[float, float, float]:

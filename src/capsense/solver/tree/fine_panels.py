@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from heapq import heappop, heappush
 from typing import NamedTuple
 
@@ -158,14 +159,53 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float, finest: float | 
     return _FEWEST * 2 ** min(doublings, _DOUBLINGS + 1)
 
 
-def wide_body(shape: Shape, pieces: int, conducting: bool) -> FinePanelBody:
-    """A wide shape, of about so many pieces."""
-    panels, coarse = panels_of(shape, pieces, merge=False), _wide(shape).coarse
+def wide_body(
+    shape: Shape, pieces: int, conducting: bool, known: FineTree | None = None
+) -> FinePanelBody:
+    """A wide shape, of about so many pieces, or of those that are known."""
+    coarse = _wide(shape).coarse
+    if known is not None:
+        return FinePanelBody(known.panels, lambda: panels_of(shape, coarse), known)
+    panels = panels_of(shape, pieces, merge=False)
     if isinstance(shape, Box) and not conducting:
         tiles = box_tiles(shape.size, coarse)
         parts = panels.areas / tiles.side(panels.centers) ** 2
-        return FinePanelBody(panels, lambda: polygon_panels(tiles.polygons()), parts)
+        ahead = fine_tree(panels, parts)
+        return FinePanelBody(panels, lambda: polygon_panels(tiles.polygons()), ahead)
     return FinePanelBody(panels, lambda: panels_of(shape, coarse))
+
+
+class FineTree(NamedTuple):
+    """Panels of a wide body in clusters."""
+
+    panels: SurfacePanels
+    """The panels, n of them."""
+    clusters: Clusters
+    """Clusters of all of them."""
+    weights: Array
+    """Charges of the panels that functions are weighted with, shape (n,)."""
+
+
+def fine_tree(panels: SurfacePanels, parts: Array | None = None) -> FineTree:
+    """Put panels into clusters.
+
+    Args:
+        panels: The panels.
+        parts: What each counts in the order of clusters, shape (n,); by default they are breadth
+            first.
+    """
+    tree = split(features(panels.centers, panels.normals, _most_apart(panels)), panels.areas)
+    if parts is not None:
+        tree = _ahead(tree, parts, _FINER)
+    _, number, above = _coarsest(tree.children, tree.panel, _CLUSTERS)
+    cluster = np.empty(len(panels), np.int64)
+    cluster[tree.panel[tree.panel >= 0]] = number[above]
+    return FineTree(panels, tree, _equilibrium(panels, cluster))
+
+
+def fine_tree_of_mesh(mesh: TriMesh, pieces: int) -> FineTree:
+    """About so many triangles of a mesh, in clusters."""
+    return fine_tree(panels_of(mesh, pieces, merge=False))
 
 
 def _ahead(tree: Clusters, parts: Array, count: int) -> Clusters:
@@ -203,6 +243,12 @@ def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
     low = float(np.ptp(arms @ np.linalg.eigh(arms.T @ arms)[1], axis=0).min())
     thickness = panels.thickness if panels.closed else low / 3  # as of a ball
     return thickness, thickness > _FLAT * low
+
+
+def _most_apart(panels: SurfacePanels) -> float:
+    """How far apart opposite normals count, see :func:`features` [m]."""
+    thickness, flat = _thickness(panels)
+    return thickness * (FACES if flat else _LIMBS)
 
 
 def _coarsest(children: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
@@ -245,11 +291,9 @@ class FinePanelBody(DynamicBody):
         panels: The many panels.
         coarse: Makes some hundred panels of the same shape, from which the impedance of the inside
             is found.
-        parts: What each panel counts in the order of clusters, shape (n,); by default they are
-            breadth first.
+        known: The panels in clusters, where that is known.
 
     Attributes:
-        most: How far apart opposite normals count, see :func:`features` [m].
         weights: Charges of the panels that functions are weighted with, shape (n,).
         keep: Returns the impedance from where it is kept, or from what makes it.
     """
@@ -258,20 +302,13 @@ class FinePanelBody(DynamicBody):
         self,
         panels: SurfacePanels,
         coarse: Callable[[], SurfacePanels],
-        parts: Array | None = None,
+        known: FineTree | None = None,
     ) -> None:
-        thickness, flat = _thickness(panels)
-        self.most, self._coarse = thickness * (FACES if flat else _LIMBS), coarse
+        self._coarse = coarse
         self.keep: Callable[[Callable[[], Array32]], Array32] = lambda make: make()
-        self._at = features(panels.centers, panels.normals, self.most)
-        tree = split(self._at, panels.areas)
-        if parts is not None:
-            tree = _ahead(tree, parts, _FINER)
-        children, number, above = _coarsest(tree.children, tree.panel, _CLUSTERS)
-        cluster = np.empty(len(panels), np.int64)
-        cluster[tree.panel[tree.panel >= 0]] = number[above]
-        self.weights = _equilibrium(panels, cluster)
+        self._fine, tree, self.weights = known or fine_tree(panels)
         super().__init__(tree, panels, charge=self.weights)
+        children, number, _ = _coarsest(tree.children, tree.panel, _CLUSTERS)
         self._points, self._softening_length = points_of_each(self._center, self._spread)
         # the body is rigid: they are needed at every step
         for name in ("points", "softening_length"):
@@ -279,10 +316,27 @@ class FinePanelBody(DynamicBody):
         last = np.flatnonzero(number >= 0)
         # of rectangles: these stand badly for larger clusters, which may be bent or have limbs
         near = means_between(self._points[last])
-        self._means = tree_kernels.means_of_clusters(near, last, children, self._charge)
+        count = len(children)
+        room = np.empty((count, len(last)), np.float32)
+        self._means = np.empty(count * (count + 1) // 2, np.float32)  # large: in large pages
+        tree_kernels.means_of_clusters(near, last, children, self._charge, room, self._means)
         """Means of 1/r within the body's first clusters, row by row up to the diagonal [1/m]."""
         self.record["inside"] = HALF_SPACE
-        self.record["means"], self.record["top"] = self._means.ctypes.data, len(children)
+        self.record["means"], self.record["top"] = self._means.ctypes.data, count
+
+    @property
+    def nbytes(self) -> int:
+        """Room that the arrays and the panels take up [bytes]."""
+        return super().nbytes + self._panel_bytes
+
+    @cached_property
+    def _panel_bytes(self) -> int:
+        return sum(a.nbytes for a in vars(self._fine).values() if isinstance(a, np.ndarray))
+
+    @property
+    def most(self) -> float:
+        """How far apart opposite normals count, see :func:`features` [m]."""
+        return _most_apart(self._fine)
 
     @property
     def neumann_to_dirichlet(self) -> Array32:
@@ -294,13 +348,14 @@ class FinePanelBody(DynamicBody):
         return once(self, "_impedance", lambda: self.keep(self._inside))
 
     def _inside(self) -> Array32:
-        panels = self._coarse()
+        panels, fine, most = self._coarse(), self._fine, self.most
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
             free = free_block(panels)
             more = impedance(panels, free) - HALF_SPACE * free
         children, number, above = _coarsest(self._children, self._panel, len(panels))
         single = np.flatnonzero(self._panel >= 0)
-        on = cKDTree(features(panels.centers, panels.normals, self.most)).query(self._at)[1]
+        at, on = (features(p.centers, p.normals, most) for p in (fine, panels))
+        on = cKDTree(on).query(at)[1]
         share = self._charge[single] / self._charge[above]
         places = number[above], on[self._panel[single]]
         shares = csr_array((share, places), (number.max() + 1, len(panels)))

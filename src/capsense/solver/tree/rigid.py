@@ -232,7 +232,7 @@ def equilibrium(free: Array, mirrors: Mirrors | None = None, left: float = _LEFT
     if mirrors is not None:
         firsts, number = np.unique(mirrors.first, return_inverse=True)
         sides = np.bincount(number).astype(float)
-        matrix = sides[:, None] * np.stack([np.bincount(number, free[i]) for i in firsts])
+        matrix = _folded(free, firsts, number, sides)
     charge = np.zeros(len(matrix))
     if not _conjugate_gradients(matrix, sides, charge, left):
         raise SolveError(
@@ -240,6 +240,18 @@ def equilibrium(free: Array, mirrors: Mirrors | None = None, left: float = _LEFT
             "than 1/20,000 as thick as they are wide, or leave out dielectric films"
         )
     return charge[number]
+
+
+@compiled
+def _folded(free: Array, firsts: Ints, number: Ints, sides: Array) -> Array:
+    """The rows of the first images, summed over mirror images and times their number, (k, k)."""
+    out = np.zeros((len(firsts), len(firsts)))
+    for k in range(len(firsts)):
+        for j in range(free.shape[1]):
+            out[k, number[j]] += free[firsts[k], j]
+        for j in range(len(firsts)):
+            out[k, j] *= sides[k]
+    return out
 
 
 @compiled

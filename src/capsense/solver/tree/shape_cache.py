@@ -17,6 +17,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._dense import mirror
 from capsense._thread_pool import ForkSafeRLock
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
@@ -33,11 +34,13 @@ from capsense.scene import (
 )
 from capsense.scene.shapes import ShapeKind
 from capsense.solver.bodies.outline import write_outline
-from capsense.solver.bodies.panels import panels_of, polygon_panels
+from capsense.solver.bodies.panels import SurfacePanels, panels_of, polygon_panels
 from capsense.solver.tree.dynamic_surface import DynamicBody, MeshBody, layer_pieces
 from capsense.solver.tree.fine_panels import (
     FACES,
     FinePanelBody,
+    FineTree,
+    fine_tree_of_mesh,
     wall_squares,
     wide_body,
     wide_pieces,
@@ -218,11 +221,24 @@ def in_pieces(shape: Shape, count: int, conducting: bool) -> tuple[DynamicBody, 
     """A wide shape of so many panels, without potential coefficients of its own."""
 
     def make(whole: Shape, count: int, name: str) -> FinePanelBody:
-        made = wide_body(whole, count, conducting)
+        known = _fine_tree(whole, count, f"{name}-wide") if isinstance(whole, TriMesh) else None
+        made = wide_body(whole, count, conducting, known)
         made.keep = lambda block: _inside_of(f"{name}-inside", block)
         return made
 
     return _kept(shape, count, "_wide" if conducting else "_filled", make)
+
+
+def _fine_tree(mesh: TriMesh, count: int, key: str) -> FineTree:
+    """The many panels of a wide mesh in clusters, from a file if there is one."""
+
+    def packed() -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        made = fine_tree_of_mesh(mesh, count)
+        arrays = _packed_panels(made.panels, made.clusters) | {"charge": made.weights}
+        return arrays, {"kind": "shape", "key": key, "closed": made.panels.closed}
+
+    arrays, meta = _stored(key, packed)
+    return FineTree(*_unpacked_panels(arrays, meta), arrays["charge"])
 
 
 def _inside_of(key: str, make: Callable[[], Array32]) -> Array32:
@@ -230,7 +246,7 @@ def _inside_of(key: str, make: Callable[[], Array32]) -> Array32:
 
     def packed() -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         block = make()
-        lower = {"block": block[np.tril_indices(len(block))]}
+        lower = {"block": block[np.tri(len(block), dtype=np.bool_)]}
         return lower, {"kind": "shape", "key": key, "size": len(block)}
 
     arrays, meta = _stored(key, packed)
@@ -264,10 +280,30 @@ def _kept(
         made.__dict__["_outline"] = whole  # which the record points to
         with _LOCK:
             found = _SHAPES[key] = _IN_USE.setdefault(key, made)
-            while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
-                _SHAPES.popitem(last=False)
+            _forget(made.nbytes)
     shape.__dict__[f"{slot} {count}"] = cast(T, found), size
     return cast(T, found), size
+
+
+_added = 0
+"""Room of the shapes that came since all were last counted [bytes]."""
+
+
+def _forget(more: int) -> None:
+    """Let the longest unused shapes go where all take up too much room.
+
+    They are counted when new ones have taken up a hundredth of it: impedances come later.
+
+    Args:
+        more: Room that a new one takes [bytes].
+    """
+    global _added
+    _added += more
+    if _added < _KEPT // 100:
+        return
+    _added, total = 0, sum(s.nbytes for s in _SHAPES.values())
+    while len(_SHAPES) > 1 and total > _KEPT:
+        total -= _SHAPES.popitem(last=False)[1].nbytes
 
 
 def _form(shape: Shape, count: int) -> tuple[float, tuple[Hashable, ...], Shape]:
@@ -350,16 +386,10 @@ def _charges(shape: RigidShape) -> Array:
 
 def _packed(shape: RigidShape, key: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """What a file holds of a shape of triangles."""
-    panels, tree = shape.panels, shape.tree
-    arrays: dict[str, NDArray[Any]] = {
-        "corners": panels.corners[:, :3],
-        "parts": panels.parts.astype(np.int32),
-        "kids": tree.children.astype(np.int32),
-        "function": tree.function.astype(np.int32),
-        "panel": tree.panel.astype(np.int32),
-        "charge": _charges(shape),
-        "energy": shape.potential_coefficients[np.tril_indices(len(panels))],
-    }
+    panels = shape.panels
+    arrays = _packed_panels(panels, shape.tree)
+    arrays["charge"] = _charges(shape)
+    arrays["energy"] = shape.potential_coefficients[np.tri(len(panels), dtype=np.bool_)]
     return arrays, {
         "kind": "shape",
         "key": key,
@@ -368,18 +398,36 @@ def _packed(shape: RigidShape, key: str) -> tuple[dict[str, NDArray[Any]], dict[
     }
 
 
+def _packed_panels(panels: SurfacePanels, tree: Clusters) -> dict[str, NDArray[Any]]:
+    """What a file holds of triangles in clusters."""
+    return {
+        "corners": panels.corners[:, :3],
+        "parts": panels.parts.astype(np.int32),
+        "kids": tree.children.astype(np.int32),
+        "function": tree.function.astype(np.int32),
+        "panel": tree.panel.astype(np.int32),
+    }
+
+
+def _unpacked_panels(
+    arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]
+) -> tuple[SurfacePanels, Clusters]:
+    """Triangles in clusters, from what a file holds of them."""
+    corners = arrays["corners"][:, [0, 1, 2, 2]]
+    panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
+    return panels, Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))
+
+
 def _from_lower(values: Array32, n: int) -> Array32:
     """A symmetric matrix from its lower triangle, row by row, (n, n)."""
     out = np.zeros((n, n), np.float32)
-    out[np.tril_indices(n)] = values
-    out += np.tril(out, -1).T
+    out[np.tri(n, dtype=np.bool_)] = values
+    mirror(out)
     return out
 
 
 def _unpacked(arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> RigidShape:
-    corners = arrays["corners"][:, [0, 1, 2, 2]]
-    panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
-    clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))
+    panels, clusters = _unpacked_panels(arrays, meta)
     energy = _from_lower(arrays["energy"], len(panels))
     return RigidShape(
         panels, charged_tree(panels, clusters, arrays["charge"]), energy,

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
+from capsense.scene.geometry_kernels import primitive_distance
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.solver.bodies.panels import SurfacePanels
 from capsense.solver.tree.dynamic_surface import OWN
@@ -27,6 +28,8 @@ Ints = NDArray[np.int64]
 
 _MOST = 5
 """Panels are halved at most so often: to 32 parts."""
+_OF_CLUSTERS = "children", "function", "charge", "center", "points", "extent", "softening_length"
+"""Arrays of a tree that go on below its panels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +50,7 @@ class RefinedShape(RigidShape):
 
     @cached_property
     def _parts(self) -> dict[str, NDArray[Any]]:
-        return _with_parts(self)
+        return _with_parts(self, *_flat(self.panels))
 
     @cached_property
     def record(self) -> np.void:
@@ -77,9 +80,10 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
         finest: Parts with a side longer than this are halved [m].
         surface: The surface that its panels approximate.
     """
-    if _longest(_flat(shape.panels)[0]) <= finest:
+    flat = _flat(shape.panels)
+    if _longest(flat[0]) <= finest:
         return shape
-    return RefinedShape(
+    out = RefinedShape(
         shape.panels,
         shape.tree,
         shape.potential_coefficients,
@@ -88,6 +92,8 @@ def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
         finest,
         surface,
     )
+    out.__dict__["_parts"] = _with_parts(out, *flat)
+    return out
 
 
 def _flat(panels: SurfacePanels) -> tuple[Array, Array]:
@@ -171,22 +177,38 @@ def _double(corners: Array, q: int) -> float:
 
 
 @compiled
-def _four_points(
-    corners: Array, panel: Ints, axes: Array, middles: Array, area: Array, extent: Array,
-    points: Array,
-) -> None:  # fmt: skip
-    """Find the four points of parts of panels, as ``rigid.four_points_of`` does those of clusters.
+def _fill_parts(parts: Any, planes: Any, surface: tuple[int, Array], out: Any) -> None:
+    """Fill in what follows the clusters of panels, at the end of arrays: parts of panels.
+
+    Their four points are as ``rigid.four_points_of`` finds those of clusters, moved onto the
+    surface along the panel's normal.
 
     Args:
-        corners: Of the parts in the planes of their panels [m], shape (k, 4, 2).
-        panel: The panel of each, shape (k,).
-        axes: Of these planes, shape (2, n, 3).
-        middles: Their origins [m], shape (n, 3).
-        area: Filled with the parts' areas [m²], shape (k,).
-        extent: Filled with their extents [m], shape (k,).
-        points: Filled with the points [m], shape (k, 4, 3).
+        parts: Panels and their parts as :func:`halved` gives them: corners, the parts of each, and
+            its panel.
+        planes: Of the panels: axes, shape (2, n, 3); origins [m], normals, and charge densities.
+        surface: The ``ShapeKind`` of what parts are moved onto, -1 for nothing, and its sizes [m].
+        out: The cluster of each panel, shape (n,); and arrays of clusters and of functions, whose
+            entries of clusters of panels are there: children, function, charge, center, points,
+            extent, softening length, own.
     """
+    (corners, below, panel), (axes, middles, normals, density) = parts, planes
+    (kind, size), (place, children, function, charge, center, points, extent, soft, own) = (
+        surface, out,
+    )  # fmt: skip
+    n, made = middles.shape[0], middles.shape[0]
     for k in range(corners.shape[0]):
+        c = place[k] if k < n else k + n - 1
+        if below[k, 0] >= 0:
+            children[c, 0], children[c, 1] = below[k, 0] + n - 1, below[k, 1] + n - 1
+            function[c] = made
+            made += 1
+        elif k >= n:
+            children[c], function[c] = -1, -1
+        if k < n:
+            if below[k, 0] >= 0:
+                own[made - 1] = OWN / extent[c]
+            continue
         x0, y0 = corners[k, 0, 0], corners[k, 0, 1]
         total = x = y = xx = yy = xy = 0.0
         for q in range(1, 3):
@@ -206,45 +228,52 @@ def _four_points(
         long = math.sqrt(0.5 * (xx + yy) + spread)
         short = math.sqrt(max(0.5 * (xx + yy) - spread, 0.0))
         cos, sin = math.cos(turn), math.sin(turn)
-        area[k], extent[k] = 0.5 * abs(total), math.sqrt(12.0) * long
-        n = panel[k]
+        extent[c], p, four = math.sqrt(12.0) * long, panel[k], points[c]
+        charge[c], soft[c] = density[p] * (0.5 * abs(total)), SOFT * extent[c]
+        if below[k, 0] >= 0:
+            own[made - 1] = OWN / extent[c]
         for d in range(3):
-            u, v = axes[0, n, d], axes[1, n, d]
-            center = middles[n, d] + ((x0 + x) * u + (y0 + y) * v)
+            u, v = axes[0, p, d], axes[1, p, d]
+            middle = middles[p, d] + ((x0 + x) * u + (y0 + y) * v)
             first = long * cos * u + long * sin * v
             second = -short * sin * u + short * cos * v
-            points[k, 0, d] = center + first + second
-            points[k, 1, d] = center + first - second
-            points[k, 2, d] = center - first + second
-            points[k, 3, d] = center - first - second
+            four[0, d] = middle + first + second
+            four[1, d] = middle + first - second
+            four[2, d] = middle - first + second
+            four[3, d] = middle - first - second
+        if kind >= 0:
+            for q in range(4):
+                off = primitive_distance(kind, size, four[q, 0], four[q, 1], four[q, 2])
+                for d in range(3):
+                    four[q, d] -= off * normals[p, d]
+        for d in range(3):
+            center[c, d] = 0.25 * (four[0, d] + four[1, d] + four[2, d] + four[3, d])
 
 
-def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
-    """What a record points to of a shape's clusters and, behind them, of its panels' parts."""
+def _with_parts(shape: RefinedShape, flat: Array, axes: Array) -> dict[str, NDArray[Any]]:
+    """What a record points to of a shape's clusters and, behind them, of its panels' parts.
+
+    Args:
+        shape: The shape.
+        flat, axes: Its panels as :func:`_flat` gives them.
+    """
     panels, tree, m = shape.panels, shape.tree, len(shape.panels)
-    flat, axes = _flat(panels)
     corners, children, panel = halved(flat, shape.finest)
-    inner, count = panel[m:], len(panel) - m
-    area, extent, points = np.empty(count), np.empty(count), np.empty((count, 4, 3))
-    _four_points(corners[m:], inner, axes, panels.centers, area, extent, points)
-    if shape.surface.kind not in (ShapeKind.BOX, ShapeKind.MESH):
-        off = shape.surface.signed_distance(points.reshape(-1, 3)).reshape(count, 4, 1)
-        points -= off * panels.normals[inner][:, None]
-    centers = 0.25 * (points[:, 0] + points[:, 1] + points[:, 2] + points[:, 3])
-    place = np.arange(len(panel)) + m - 1  # clusters of panels and parts
-    place[tree.panel[tree.panel >= 0]] = np.flatnonzero(tree.panel >= 0)
-    cut = np.flatnonzero(children[:, 0] >= 0)
-    all_kids = np.concatenate([tree.children, np.full((count, 2), -1)])
-    all_kids[place[cut]] = place[children[cut]]
-    function = np.concatenate([tree.function, np.full(count, -1)])
-    function[place[cut]] = m + np.arange(len(cut))
-    density = tree.charge[place[:m]] / panels.areas
-    size = np.concatenate([tree.extent, extent])
-    return {
-        "children": all_kids, "function": function, "extent": size,
-        "own": np.concatenate([shape.own, OWN / size[place[cut]]]),
-        "charge": np.concatenate([tree.charge, density[inner] * area]),
-        "center": np.concatenate([tree.center, centers]),
-        "points": np.concatenate([tree.points, points]),
-        "softening_length": np.concatenate([tree.softening_length, SOFT * extent]),
-    }  # fmt: skip
+    single = np.flatnonzero(tree.panel >= 0)
+    place = np.empty(m, np.int64)  # clusters of panels
+    place[tree.panel[single]] = single
+    arrays = {name: getattr(tree, name) for name in _OF_CLUSTERS} | {"own": shape.own}
+    out = {}
+    for name, values in arrays.items():
+        count = m + (len(panel) - m) // 2 if name == "own" else len(panel) + m - 1
+        out[name] = np.empty((count, *values.shape[1:]), values.dtype)
+        out[name][: len(values)] = values
+    surface = shape.surface
+    curved = surface.kind not in (ShapeKind.BOX, ShapeKind.MESH)
+    _fill_parts(
+        (corners, children, panel),
+        (axes, panels.centers, panels.normals, tree.charge[place] / panels.areas),
+        (int(surface.kind), surface.params) if curved else (-1, np.zeros(3)),
+        (place, *out.values()),
+    )
+    return out

@@ -6,7 +6,6 @@ import numpy as np
 
 from capsense._dense import mirror
 from capsense._jit import compiled, kernel
-from capsense._simd import WIDE
 
 _BLOCK = 64
 """Rows and columns of a table that are turned at a time."""
@@ -281,20 +280,19 @@ def table_of_functions(block, children, panel, charge, function):
 
 
 @compiled
-def means_of_clusters(means, last, children, charge):
+def means_of_clusters(means, last, children, charge, rows, out):
     """Means between clusters from those between the smallest ones.
 
     Args:
         means: Of a symmetric function, between clusters without parts here, shape (k, k).
-        last: Which clusters these are, shape (k,).
+        last: Which clusters these are, ascending, shape (k,).
         children: Parts of the clusters, behind them; -1 for none, shape (t, 2).
         charge: Charges of the clusters, shape (t,).
-
-    Returns:
-        Row by row up to the diagonal, shape (t (t + 1) / 2,).
+        rows: Room to work in, shape (t, k), single precision.
+        out: Filled row by row up to the diagonal, shape (t (t + 1) / 2,), single precision.
     """
     count, many = children.shape[0], last.shape[0]
-    rows, share = np.empty((count, many), np.float32), np.empty(count, np.float32)
+    share = np.empty(count, np.float32)
     for j in range(many):
         rows[last[j]] = means[j]
     for a in range(count - 1, -1, -1):
@@ -303,24 +301,20 @@ def means_of_clusters(means, last, children, charge):
             share[a] = charge[children[a, 0]] / charge[a]
             for j in range(many):
                 mean[j] = second[j] + share[a] * (first[j] - second[j])
-    out = np.empty(count * (count + 1) // 2, np.float32)
-    lines = np.empty((count, WIDE), np.float32)  # so many rows at a time, turned
-    for start in range(0, count, WIDE):
-        width = min(WIDE, count - start)
-        for j in range(many):
-            line = lines[last[j]]
-            for c in range(width):
-                line[c] = rows[start + c, j]
-        for k in range(count - 1, -1, -1):
-            if children[k, 0] >= 0:
-                first, second, line = lines[children[k, 0]], lines[children[k, 1]], lines[k]
-                for c in range(WIDE):
-                    line[c] = second[c] + share[k] * (first[c] - second[c])
-        for c in range(width):
-            a = start + c
-            for k in range(a + 1):
-                out[a * (a + 1) // 2 + k] = lines[k, c]
-    return out
+    for low in range(0, many, _BLOCK):  # blocks stay in the cache while they are turned
+        high = min(low + _BLOCK, many)
+        for start in range(0, last[high - 1] + 1, _BLOCK):
+            for j in range(low, high):
+                place = last[j] * (last[j] + 1) // 2
+                for a in range(start, min(start + _BLOCK, last[j] + 1)):
+                    out[place + a] = rows[a, j]
+    for k in range(count - 1, -1, -1):
+        if children[k, 0] >= 0:
+            i, j = children[k, 0], children[k, 1]
+            first, second = out[i * (i + 1) // 2 :], out[j * (j + 1) // 2 :]
+            line = out[k * (k + 1) // 2 :]
+            for a in range(k + 1):
+                line[a] = second[a] + share[k] * (first[a] - second[a])
 
 
 @kernel
