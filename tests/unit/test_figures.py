@@ -86,7 +86,7 @@ def test_text_between_markers(tmp_path: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert text == "a\n<!-- x -->\nnew\nlines\n<!-- end -->\nb <!-- end -->\n"
     assert pages.between(text, ("<!-- x -->", "<!-- end -->")) == "new\nlines"
-    with pytest.raises(ValueError, match="substring not found"):
+    with pytest.raises(ValueError, match="has no lines '<!-- y -->'"):
         pages.write_between(page, ("<!-- y -->", "<!-- end -->"), "new")
 
 

@@ -10,14 +10,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
+from capsense.scene.ellipsoid_kernels import ellipsoid_distance
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
 
 _LEAF = 4
 """Triangles in a box without parts, at most."""
-_NEWTON = 50
-"""Newton steps towards the nearest point of an ellipsoid, at most."""
 _ROUNDED = 1 + 1e-9
 """Makes room for the rounding of an upper bound."""
 
@@ -312,36 +311,7 @@ def primitive_distance(kind: int, size: Array, x: float, y: float, z: float) -> 
         side, end = math.sqrt(x * x + y * y) - size[0], abs(z) - size[1]
         over, beyond = max(side, 0.0), max(end, 0.0)
         return math.sqrt(over * over + beyond * beyond) + min(max(side, end), 0.0)
-    return _ellipsoid_distance(size, x, y, z)
-
-
-@kernel
-def _ellipsoid_distance(radii: Array, x: float, y: float, z: float) -> float:
-    """As of ``Ellipsoid.signed_distance``."""
-    a, b, c = radii[0], radii[1], radii[2]
-    least = min(a, min(b, c))
-    x, y, z = (max(abs(x), 1e-9 * least), max(abs(y), 1e-9 * least), max(abs(z), 1e-9 * least))
-    p, q, r = a * a - least * least, b * b - least * least, c * c - least * least
-    s = max(a * x - p, max(b * y - q, c * z - r))
-    for _ in range(_NEWTON):
-        u, v, w = a * x / (s + p), b * y / (s + q), c * z / (s + r)
-        u, v, w = u * u, v * v, w * w
-        step = 0.5 * (u + v + w - 1.0) / (u / (s + p) + v / (s + q) + w / (s + r))
-        s += max(step, 0.0)
-        if step <= 1e-14 * s:
-            break
-    u, v, w = x - a * a * x / (s + p), y - b * b * y / (s + q), z - c * c * z / (s + r)
-    distance = math.sqrt(u * u + v * v + w * w)
-    return -distance if (x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2 < 1.0 else distance
-
-
-@compiled
-def ellipsoid_distances(points: Array, radii: Array) -> Array:
-    """Distances of points (n, 3) from an ellipsoid of half axes (3,) [m], negative inside."""
-    out = np.empty(points.shape[0])
-    for k in range(points.shape[0]):
-        out[k] = _ellipsoid_distance(radii, points[k, 0], points[k, 1], points[k, 2])
-    return out
+    return ellipsoid_distance(size, x, y, z)
 
 
 @compiled

@@ -348,7 +348,7 @@ class Ellipsoid(_Primitive):
         of s = t + min r² no digits are lost. Coordinates are kept 1e-9 off the planes of
         symmetry, where the root is not simple.
         """
-        from capsense.scene.geometry_kernels import ellipsoid_distances
+        from capsense.scene.ellipsoid_kernels import ellipsoid_distances
 
         return ellipsoid_distances(np.ascontiguousarray(as_points(points)), self.params)
 
