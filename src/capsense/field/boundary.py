@@ -48,8 +48,6 @@ _FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
 _FINEST, _COARSEST = 0.5, 8.0
 """The finest, and where the search begins, as multiples of the default sizes."""
-_SIDES = 512
-"""Point charges whose answers are found at a time."""
 POWER = 1.7
 """The number of panels goes with their size to minus this power, about."""
 
@@ -293,42 +291,42 @@ class BoundarySolution:
         """Charge densities over 4π eps0 of right-hand sides in the order of the panels, (n, k)."""
         return np.asarray(scipy.linalg.lu_solve(self._lu, sides, trans=1))
 
-    def responses(self, points: Array, densities: Array) -> tuple[Array, Array]:
-        """Potentials at points [m] of what charges at all of them draw, and of densities.
-
-        Args:
-            points: Shape (n, 3). Each in turn has a point charge of 4π eps0 · 1 V·m, with all
-                terminals at ground.
-            densities: Charge densities on the panels [C/m²], shape (panels, k).
-
-        Returns:
-            The potentials of the charges that are drawn, without those of the point charges [V],
-            shape (n, n); and of the densities [V], shape (n, k).
-        """
-        potentials = self._potentials(points)
-        drawn = np.empty((len(points), len(points)))
-        for start in range(0, len(points), _SIDES):
-            some = slice(start, start + _SIDES)
-            drawn[:, some] = potentials @ self.solve(
-                self._source_terms(points[some], potentials[some])
-            )
-        return drawn, potentials @ (densities / UNIT)
+    def answers(self, points: Array) -> Answers:
+        """What point charges at points [m] draw while all terminals are at ground, (n, 3)."""
+        return Answers(self, np.ascontiguousarray(points))
 
     def _potentials(self, points: Array) -> Array:
         """Potentials at points of unit densities, times 4π eps0, (n, 3) -> (n, panels)."""
         return kernels.potential_matrix(points, self.model.floor, self.model.panels)
 
-    def _source_terms(self, points: Array, potentials: Array) -> Array:
-        """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
+    def _source_terms(
+        self, points: Array, potentials: Array, charges: Array | None = None
+    ) -> Array:
+        """Right-hand sides of 1/r sources and their images, means over panels.
+
+        Args:
+            points: Where they are [m], shape (s, 3).
+            potentials: :meth:`_potentials` of these, (s, panels).
+            charges: Of the sources, for each side, (s, k); by default one side for each source,
+                of a unit charge.
+
+        Returns:
+            Shape (panels, k), in order for LAPACK.
+        """
         panels, floor = self.model.panels, self.model.floor
-        rhs = np.negative(potentials).T  # as LAPACK has it
+
+        def of(values: Array) -> Array:
+            return np.negative(values if charges is None else charges.T @ values).T
+
+        sides = of(potentials)
         rows = np.flatnonzero(self.model.owner == INTERFACE)
         if len(rows):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
-            flux = kernels.flux_matrix(points, rows, floor, panels)
-            rhs[rows] = self.contrast[rows, None] * flux.T
-        rhs /= panels.areas[:, None]
-        return rhs
+            sides[rows] = -self.contrast[rows, None] * of(
+                kernels.flux_matrix(points, rows, floor, panels)
+            )
+        sides /= panels.areas[:, None]
+        return sides
 
     def free_densities(self, densities: Array) -> Array:
         """Free charge density [C/m²] on the panels of conductors, of total densities, (n, k)."""
@@ -360,3 +358,41 @@ class BoundarySolution:
             block = np.ascontiguousarray(points[start : start + chunk])
             out[start : start + chunk] = self._potentials(block) @ scaled
         return out
+
+
+class Answers:
+    """Potentials at points of the charges that a grounded design answers with to charges there.
+
+    They make a matrix D [1/m], shape (n, n): at each point, the potential of what a charge of 4π
+    eps0 · 1 V·m at each of them draws, without that of the charge itself. D = P A⁻¹ T is never
+    made as a whole: A is the system of the boundary elements, P the potentials of their panels at
+    the points, and T their right-hand sides.
+
+    Args:
+        solution: The factorised boundary elements of the design.
+        points: Where potentials and charges are [m], shape (n, 3).
+    """
+
+    def __init__(self, solution: BoundarySolution, points: Array) -> None:
+        self._solution, self._points = solution, points
+        self._potentials = solution._potentials(points)
+
+    def of_densities(self, densities: Array) -> Array:
+        """Potentials of charge densities on the panels [C/m²] at the points [V], (n, k)."""
+        return self._potentials @ (densities / UNIT)
+
+    def between(self, charges: Array) -> Array:
+        """Qᵀ D Q of charges Q at the points, shape (n, k) -> (k, k).
+
+        It takes k solutions of the boundary elements, where D takes n.
+        """
+        drawn = self._solution.solve(
+            self._solution._source_terms(self._points, self._potentials, charges)
+        )
+        return (charges.T @ self._potentials) @ drawn
+
+    def at(self, some: NDArray[np.intp]) -> Array:
+        """Rows and columns of D of some of the points, shape (s, s)."""
+        potentials = self._potentials[some]
+        sides = self._solution._source_terms(self._points[some], potentials)
+        return potentials @ self._solution.solve(sides)

@@ -254,8 +254,12 @@ def _means(green: GreenFunction, plane: Panels) -> tuple[Array, Array]:
     parts = []
     for start in range(0, plane.size, _PART):
         some = slice(start, start + _PART)
-        both = np.hstack(green.psi_and_phi0(plane.quad[some].reshape(-1, 3)))
-        parts.append(np.einsum("mqk,mq->mk", both.reshape(*share[some].shape, -1), share[some]))
+        used = plane.weights[some] > 0.0  # panels of few corners have fewer points
+        both = np.hstack(green.psi_and_phi0(plane.quad[some][used]))
+        panel = np.repeat(np.arange(len(used)), used.sum(axis=1))
+        where = panel, np.arange(len(panel))
+        mean = csr_array((share[some][used], where), (len(used), len(panel)))
+        parts.append(mean @ both)
     means = np.concatenate(parts)
     return means[:, : green.n_modes], means[:, green.n_modes :]
 
