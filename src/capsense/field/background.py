@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._thread_pool import one_blas_thread
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
@@ -116,13 +117,14 @@ def build_background(
             tell(stage, _STAGES.get(stage, 0.0))
 
     names, unit = tuple(terminals(design)), design.unit
-    solution, densities, capacitance = solve_empty(design, settings, begin)
-    green = build_green(solution, densities, begin)
-    count = len(densities)
-    if has_even_face(solution.design):
-        solution = table_solution(solution, settings.panel_scale)  # the finer one is given up
-        table = gap_table_of(solution, settings.panel_scale, green, begin)
-        green = replace(green, gap=table)
+    with one_blas_thread():
+        solution, densities, capacitance = solve_empty(design, settings, begin)
+        green = build_green(solution, densities, begin)
+        count = len(densities)
+        if has_even_face(solution.design):
+            solution = table_solution(solution, settings.panel_scale)  # the finer one is given up
+            table = gap_table_of(solution, settings.panel_scale, green, begin)
+            green = replace(green, gap=table)
     green = replace(green, unit=unit)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, count, green)
@@ -139,7 +141,8 @@ def empty_capacitance(design: Design, settings: BuildSettings | None = None) -> 
     Raises:
         FieldError: The geometry needs more panels than fit, or a result is not finite.
     """
-    return solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
+    with one_blas_thread():
+        return solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
 
 
 def solve_empty(

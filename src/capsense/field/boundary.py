@@ -266,6 +266,7 @@ class BoundarySolution:
         self.contrast = (self.model.eps_front - self.model.eps_back) / (
             self.model.eps_front + self.model.eps_back
         )
+        self._interfaces = np.flatnonzero(owner == INTERFACE)
         self.kind = np.where(owner == INTERFACE, 1 + any(k.facets != () for k in design.layers), 0)
         matrix = kernels.system_matrix(self.kind, self.contrast, self.model.floor, panels)
         progress("boundary elements: factorising")
@@ -284,7 +285,7 @@ class BoundarySolution:
         rhs[driven] = potentials[owner[driven]]
         if sources is not None:
             points = np.ascontiguousarray(sources)
-            rhs += self._source_terms(points, self._potentials(points))
+            rhs += self._source_terms(self._potentials(points), self._fluxes(points))
         return UNIT * self.solve(rhs)
 
     def solve(self, sides: Array) -> Array:
@@ -299,34 +300,24 @@ class BoundarySolution:
         """Potentials at points of unit densities, times 4π eps0, (n, 3) -> (n, panels)."""
         return kernels.potential_matrix(points, self.model.floor, self.model.panels)
 
-    def _source_terms(
-        self, points: Array, potentials: Array, charges: Array | None = None
-    ) -> Array:
-        """Right-hand sides of 1/r sources and their images, means over panels.
+    def _fluxes(self, points: Array) -> Array:
+        """Fluxes of unit 1/r sources at points through the panels of interfaces, (n, rows)."""
+        rows, model = self._interfaces, self.model
+        if not len(rows):
+            return np.empty((len(points), 0))
+        return kernels.flux_matrix(points, rows, model.floor, model.panels)
 
-        Args:
-            points: Where they are [m], shape (s, 3).
-            potentials: :meth:`_potentials` of these, (s, panels).
-            charges: Of the sources, for each side, (s, k); by default one side for each source,
-                of a unit charge.
+    def _source_terms(self, potentials: Array, fluxes: Array) -> Array:
+        """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k).
 
-        Returns:
-            Shape (panels, k), in order for LAPACK.
+        Of sources with other charges, by :meth:`_potentials` and :meth:`_fluxes` times these.
         """
-        panels, floor = self.model.panels, self.model.floor
-
-        def of(values: Array) -> Array:
-            return np.negative(values if charges is None else charges.T @ values).T
-
-        sides = of(potentials)
-        rows = np.flatnonzero(self.model.owner == INTERFACE)
-        if len(rows):
+        rhs = np.negative(potentials).T  # as LAPACK has it
+        if len(self._interfaces):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
-            sides[rows] = -self.contrast[rows, None] * of(
-                kernels.flux_matrix(points, rows, floor, panels)
-            )
-        sides /= panels.areas[:, None]
-        return sides
+            rhs[self._interfaces] = self.contrast[self._interfaces, None] * fluxes.T
+        rhs /= self.model.panels.areas[:, None]
+        return rhs
 
     def free_densities(self, densities: Array) -> Array:
         """Free charge density [C/m²] on the panels of conductors, of total densities, (n, k)."""
@@ -374,25 +365,26 @@ class Answers:
     """
 
     def __init__(self, solution: BoundarySolution, points: Array) -> None:
-        self._solution, self._points = solution, points
-        self._potentials = solution._potentials(points)
+        self._solution = solution
+        self._potentials, self._fluxes = solution._potentials(points), solution._fluxes(points)
 
     def of_densities(self, densities: Array) -> Array:
         """Potentials of charge densities on the panels [C/m²] at the points [V], (n, k)."""
         return self._potentials @ (densities / UNIT)
 
-    def between(self, charges: Array) -> Array:
-        """Qᵀ D Q of charges Q at the points, shape (n, k) -> (k, k).
+    def by(self, charges: Array) -> Array:
+        """D Q of charges Q at the points, shape (n, k) -> (n, k).
 
-        It takes k solutions of the boundary elements, where D takes n.
+        It takes k solutions of the boundary elements, where all of D takes n.
         """
-        drawn = self._solution.solve(
-            self._solution._source_terms(self._points, self._potentials, charges)
-        )
-        return (charges.T @ self._potentials) @ drawn
+        return self._potentials @ self._drawn(charges.T @ self._potentials, charges)
 
-    def at(self, some: NDArray[np.intp]) -> Array:
-        """Rows and columns of D of some of the points, shape (s, s)."""
-        potentials = self._potentials[some]
-        sides = self._solution._source_terms(self._points[some], potentials)
-        return potentials @ self._solution.solve(sides)
+    def between(self, charges: Array) -> Array:
+        """Qᵀ D Q of charges Q at the points, shape (n, k) -> (k, k)."""
+        sides = charges.T @ self._potentials
+        return sides @ self._drawn(sides, charges)
+
+    def _drawn(self, potentials: Array, charges: Array) -> Array:
+        """Densities over 4π eps0 that charges draw, from their potentials too, (panels, k)."""
+        fluxes = charges.T @ self._fluxes
+        return self._solution.solve(self._solution._source_terms(potentials, fluxes))
