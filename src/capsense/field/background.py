@@ -83,10 +83,10 @@ class BackgroundField:
 
 
 _STAGES = {
-    "boundary elements: factorising": 0.2,
-    "response to charges: where": 0.2,
-    "response to charges: boundary elements": 0.3,
-    "response to charges: fit": 0.5,
+    "boundary elements: factorising": 0.1,
+    "response to charges: where": 0.15,
+    "response to charges: boundary elements": 0.2,
+    "response to charges: fit": 0.25,
 }
 """Share of a build's time that is over when a stage begins; 0 for the others."""
 
@@ -111,7 +111,7 @@ def build_background(
     def begin(stage: str) -> None:
         count = re.fullmatch(r"response to (?:a )?(plane|compression): (\d+) of (\d+)", stage)
         if count:
-            start, share = (0.6, 0.3) if count[1] == "plane" else (0.9, 0.1)
+            start, share = (0.4, 0.5) if count[1] == "plane" else (0.9, 0.1)
             tell(stage, start + share * (int(count[2]) - 1) / int(count[3]))
         else:
             tell(stage, _STAGES.get(stage, 0.0))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -21,6 +22,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from capsense._thread_pool import processors
 from capsense.constants import EPS0, UNIT
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
@@ -65,6 +67,8 @@ _CELL = 0.6
 """Size of the cells of the table, over the validity distance."""
 _CELLS = 16_000
 """At most about so many cells."""
+_AT_ONCE = 4
+"""At most so many distances are solved for at a time: each takes memory."""
 _PART = 500
 """So many panels at a time have their potentials averaged."""
 _LEAST = 0.003
@@ -190,14 +194,23 @@ def build_gap_table(
     plates = plates_of(plane.panels, design)
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
     response, errors = PlaneResponse(solution), np.full(len(heights), np.inf)
-    for k, height in enumerate(heights):
-        progress(f"response to a plane: {k + 1} of {len(heights)}")
-        panels = plane.at(top + height)
+
+    def solve(k: int) -> None:
+        panels = plane.at(top + heights[k])
         found = response.at(panels, densities)
         changes[k] = found.change[: model.sheet_panels]
-        if green is not None and height >= _SOUGHT * unit:
+        if green is not None and heights[k] >= _SOUGHT * unit:
             errors[k] = energy_error(found, panels, plates, green)
-        del found
+
+    with ThreadPoolExecutor(min(_AT_ONCE, processors()), "capsense") as pool:
+        parts = [pool.submit(solve, k) for k in range(len(heights))]
+        try:
+            for k, part in enumerate(parts):
+                progress(f"response to a plane: {k + 1} of {len(heights)}")
+                part.result()
+        finally:
+            for part in parts:  # after an interrupt, those that have not begun
+                part.cancel()
     validity = unit if green is None else valid_from(heights, errors)
     return _cells_of(solution, changes, heights, top, validity, plane.panels)
 
