@@ -7,15 +7,13 @@ import os
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from capsense._validate import as_whole
 from capsense.errors import CapSenseError, listed
@@ -94,32 +92,6 @@ class ForkSafeRLock:
 
     def __reduce__(self) -> tuple[type[ForkSafeRLock], tuple[()]]:
         return ForkSafeRLock, ()
-
-
-_blas_lock = ForkSafeRLock()
-_blas_users = 0
-_blas_limits: threadpool_limits | None = None
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """With one thread in BLAS and LAPACK, for all of the process, until the last one leaves.
-
-    Results then do not depend on how many threads they have. Theirs wait for each other without
-    sleeping: where other processes want the processors too, most of the time goes to that.
-    """
-    global _blas_users, _blas_limits
-    with _blas_lock:
-        if _blas_users == 0:
-            _blas_limits = threadpool_limits(1, "blas")
-        _blas_users += 1
-    try:
-        yield
-    finally:
-        with _blas_lock:
-            _blas_users -= 1
-            if _blas_users == 0 and _blas_limits is not None:
-                _blas_limits.restore_original_limits()
 
 
 class ThreadPool:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from capsense._thread_pool import one_blas_thread
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
@@ -117,7 +117,9 @@ def build_background(
             tell(stage, _STAGES.get(stage, 0.0))
 
     names, unit = tuple(terminals(design)), design.unit
-    with one_blas_thread():
+    # Bits depend on how many threads a BLAS has. They wait without sleeping, too: beside other
+    # processes most of the time of a small design goes to that.
+    with threadpool_limits(1, "blas"):
         solution, densities, capacitance = solve_empty(design, settings, begin)
         green = build_green(solution, densities, begin)
         count = len(densities)
@@ -141,7 +143,7 @@ def empty_capacitance(design: Design, settings: BuildSettings | None = None) -> 
     Raises:
         FieldError: The geometry needs more panels than fit, or a result is not finite.
     """
-    with one_blas_thread():
+    with threadpool_limits(1, "blas"):
         return solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
 
 

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from threadpoolctl import threadpool_limits
 
 from capsense._thread_pool import processors
 from capsense.constants import EPS0, UNIT
@@ -195,6 +196,7 @@ def build_gap_table(
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
     response, errors = PlaneResponse(solution), np.full(len(heights), np.inf)
 
+    @threadpool_limits.wrap(limits=1, user_api="blas")  # with OpenMP it is one for each thread
     def solve(k: int) -> None:
         panels = plane.at(top + heights[k])
         found = response.at(panels, densities)
