@@ -290,7 +290,9 @@ class BoundarySolution:
 
     def solve(self, sides: Array) -> Array:
         """Charge densities over 4π eps0 of right-hand sides in the order of the panels, (n, k)."""
-        return np.asarray(scipy.linalg.lu_solve(self._lu, sides, trans=1))
+        matrix, pivots = self._lu
+        # SciPy counts pivots up while LAPACK has them, and down again: each thread has its own.
+        return np.asarray(scipy.linalg.lu_solve((matrix, pivots.copy()), sides, trans=1))
 
     def answers(self, points: Array) -> Answers:
         """What point charges at points [m] draw while all terminals are at ground, (n, 3)."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
 from approximate import approx
+from threadpoolctl import threadpool_limits
 
 from capsense.constants import EPS0
 from capsense.design import parse_design
@@ -126,6 +128,16 @@ def test_charges_are_those_of_design_and_plane_solved_anew():
         np.testing.assert_allclose(found[:2], (both[:2, :2] - alone)[i], rtol=0.03, atol=2e-15)
         assert found[2] == approx(both[i, 2], rel=0.03)
     assert len(change) == n
+
+
+def test_threads_solve_beside_each_other():
+    """Regression: SciPy changes the pivots of a factorisation while LAPACK has them."""
+    solution, _ = _solved(PAD)
+    sides = np.random.default_rng(1).normal(size=(solution.model.panels.size, 300))
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(4) as pool:
+        expected = solution.solve(sides)
+        for found in pool.map(lambda _: solution.solve(sides), range(40)):
+            np.testing.assert_array_equal(found, expected)
 
 
 def test_means_over_panels_are_those_of_all_points_of_their_quadratures():
