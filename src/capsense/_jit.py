@@ -30,6 +30,7 @@ from numba.core.registry import CPUDispatcher
 from capsense import _kernel_cache
 
 _log = logging.getLogger("capsense")
+_progress = logging.getLogger("capsense.kernels")
 
 WAIT = 2.0
 """Compiling that takes longer than this [s] is announced."""
@@ -112,8 +113,8 @@ compiled in this process."""
 def _announced() -> Iterator[None]:
     """Log that kernels are compiled, once in a process, where that takes longer than ``WAIT``.
 
-    While it goes on, how many there are follows every ten seconds. These are warnings of the logger
-    ``capsense``, which go to standard error unless told otherwise.
+    While it goes on, how many there are follows every ten seconds. These are warnings of the
+    loggers ``capsense`` and ``capsense.kernels``, which go to standard error unless told otherwise.
     """
     global _depth, _count
     done = threading.Event()
@@ -141,7 +142,7 @@ def _tell(done: threading.Event) -> None:
             "capsense warmup does it ahead of time", often,
         )  # fmt: skip
     while not done.wait(EVERY):
-        _log.warning("compiling kernels: %d so far", _count)
+        _progress.warning("compiling kernels: %d so far", _count)
 
 
 class _PartCache(_Cache):

@@ -140,10 +140,10 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
 def build_cost(panels: int) -> tuple[float, float]:
     """Estimated processor time [s] and memory [byte] of building a field of so many panels.
 
-    From builds of 5,262 panels (62 s, ``examples/layout/slider_counts.py``), of 7,994 (110 s,
-    ``examples/painted_skin.py``) and of 9,013 (3.2 GB), on two slow cores.
+    From builds of 297 panels (5 s, ``docs/tutorials/electrodes.md``), of 2,957 (26 s,
+    ``three_stripes``), of 6,228 (48 s, ``six_patch``) and of 9,013 (3.2 GB), on two slow cores.
     """
-    return 8.0 + 2e-6 * panels**2, 4e8 + 33.0 * panels**2
+    return 4.0 + 6.5e-3 * panels + 1.5e-11 * panels**3, 4e8 + 33.0 * panels**2
 
 
 def _fitted(design: Design) -> float:
