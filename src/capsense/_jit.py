@@ -30,9 +30,12 @@ from numba.core.registry import CPUDispatcher
 from capsense import _kernel_cache
 
 _log = logging.getLogger("capsense")
+_progress = logging.getLogger("capsense.kernels")
 
 WAIT = 2.0
 """Compiling that takes longer than this [s] is announced."""
+EVERY = 10.0
+"""Seconds between messages that tell how many kernels are compiled."""
 _PLAIN = os.environ.get("CAPSENSE_PLAIN_NUMBA", "0") not in ("", "0")
 """``CAPSENSE_PLAIN_NUMBA=1``: ``numba.njit(cache=True)`` alone compiles kernels. It uses public
 interfaces of Numba only, takes longer, and notices changed sources of a kernel's own file only."""
@@ -101,38 +104,45 @@ class _Cache(FunctionCache):
                 lock.release()
 
 
-_depth, _said = 0, False
-"""How many kernels are being compiled, one for another; whether it was announced."""
+_depth, _said, _count = 0, False, 0
+"""How many kernels are being compiled, one for another; whether it was announced; how many were
+compiled in this process."""
 
 
 @contextmanager
 def _announced() -> Iterator[None]:
-    """Log once in a process that kernels are compiled, where that takes longer than ``WAIT``.
+    """Log that kernels are compiled, once in a process, where that takes longer than ``WAIT``.
 
-    It is a warning of the logger ``capsense``, which goes to standard error unless told otherwise.
+    While it goes on, how many there are follows every ten seconds. These are warnings of the
+    loggers ``capsense`` and ``capsense.kernels``, which go to standard error unless told otherwise.
     """
-    global _depth
-    timer = threading.Timer(WAIT, _announce) if _depth == 0 and not _said else None
-    if timer is not None:
-        timer.daemon = True
-        timer.start()
+    global _depth, _count
+    done = threading.Event()
+    if _depth == 0:
+        threading.Thread(target=_tell, args=(done,), daemon=True).start()
     _depth += 1
     try:
         yield
     finally:
         _depth -= 1
-        if timer is not None:
-            timer.cancel()
+        _count += 1
+        done.set()
 
 
-def _announce() -> None:
+def _tell(done: threading.Event) -> None:
+    """Announce what goes on until an event, and how far it is."""
     global _said
-    _said = True
-    often = "once on this machine" if _kernel_cache.kept else "in each process"
-    _log.warning(
-        "compiling kernels for this processor; it takes about a minute %s; "
-        "capsense warmup does it ahead of time", often,
-    )  # fmt: skip
+    if not _said:
+        if done.wait(WAIT):
+            return
+        _said = True
+        often = "once on this machine" if _kernel_cache.kept else "in each process"
+        _log.warning(
+            "compiling kernels for this processor; it takes about a minute %s; "
+            "capsense warmup does it ahead of time", often,
+        )  # fmt: skip
+    while not done.wait(EVERY):
+        _progress.warning("compiling kernels: %d so far", _count)
 
 
 class _PartCache(_Cache):

@@ -77,6 +77,27 @@ def test_what_is_announced(
     assert ("in each process" in caplog.messages[0]) != kept
 
 
+def test_how_far_it_is_is_told_again_and_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """From the first announcement on, with how many kernels there are; not after the last one."""
+    monkeypatch.setattr(_jit, "_said", False)
+    monkeypatch.setattr(_jit, "WAIT", 0.0)
+    monkeypatch.setattr(_jit, "EVERY", 0.2)
+    with _jit._announced():
+        for _ in range(2):
+            with _jit._announced():
+                time.sleep(0.3)
+    told = [re.fullmatch(r"compiling kernels: (\d+) so far", m) for m in caplog.messages[1:]]
+    counts = [int(found[1]) for found in told if found]
+    assert len(counts) == len(told) >= 2
+    assert counts == sorted(counts)
+    assert counts[0] < counts[-1]
+    said = len(caplog.messages)
+    time.sleep(0.5)
+    assert len(caplog.messages) == said
+
+
 def test_nothing_is_announced_of_kernels_that_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,7 +26,9 @@ def warmup(args: argparse.Namespace) -> int:
       capsense warmup
       capsense warmup --quiet
     """
-    logging.getLogger("capsense").setLevel(logging.ERROR)  # what is announced is what is done
+    logging.getLogger("capsense").setLevel(logging.ERROR)  # what is announced is what is done …
+    if not args.quiet:  # … but for how many kernels there are so far
+        logging.getLogger("capsense.kernels").setLevel(logging.WARNING)
     start = perf_counter()
     for name, run in stages():
         before = perf_counter()

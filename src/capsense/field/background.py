@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
@@ -82,10 +83,10 @@ class BackgroundField:
 
 
 _STAGES = {
-    "boundary elements: factorising": 0.2,
-    "response to charges: where": 0.2,
-    "response to charges: boundary elements": 0.3,
-    "response to charges: fit": 0.5,
+    "boundary elements: factorising": 0.1,
+    "response to charges: where": 0.15,
+    "response to charges: boundary elements": 0.2,
+    "response to charges: fit": 0.25,
 }
 """Share of a build's time that is over when a stage begins; 0 for the others."""
 
@@ -110,19 +111,22 @@ def build_background(
     def begin(stage: str) -> None:
         count = re.fullmatch(r"response to (?:a )?(plane|compression): (\d+) of (\d+)", stage)
         if count:
-            start, share = (0.6, 0.3) if count[1] == "plane" else (0.9, 0.1)
+            start, share = (0.4, 0.5) if count[1] == "plane" else (0.9, 0.1)
             tell(stage, start + share * (int(count[2]) - 1) / int(count[3]))
         else:
             tell(stage, _STAGES.get(stage, 0.0))
 
     names, unit = tuple(terminals(design)), design.unit
-    solution, densities, capacitance = solve_empty(design, settings, begin)
-    green = build_green(solution, densities, begin)
-    count = len(densities)
-    if has_even_face(solution.design):
-        solution = table_solution(solution, settings.panel_scale)  # the finer one is given up
-        table = gap_table_of(solution, settings.panel_scale, green, begin)
-        green = replace(green, gap=table)
+    # Bits depend on how many threads a BLAS has. They wait without sleeping, too: beside other
+    # processes most of the time of a small design goes to that.
+    with threadpool_limits(1, "blas"):
+        solution, densities, capacitance = solve_empty(design, settings, begin)
+        green = build_green(solution, densities, begin)
+        count = len(densities)
+        if has_even_face(solution.design):
+            solution = table_solution(solution, settings.panel_scale)  # the finer one is given up
+            table = gap_table_of(solution, settings.panel_scale, green, begin)
+            green = replace(green, gap=table)
     green = replace(green, unit=unit)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, count, green)
@@ -139,7 +143,8 @@ def empty_capacitance(design: Design, settings: BuildSettings | None = None) -> 
     Raises:
         FieldError: The geometry needs more panels than fit, or a result is not finite.
     """
-    return solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
+    with threadpool_limits(1, "blas"):
+        return solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
 
 
 def solve_empty(

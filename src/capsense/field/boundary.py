@@ -48,8 +48,6 @@ _FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
 _FINEST, _COARSEST = 0.5, 8.0
 """The finest, and where the search begins, as multiples of the default sizes."""
-_SIDES = 512
-"""Point charges whose answers are found at a time."""
 POWER = 1.7
 """The number of panels goes with their size to minus this power, about."""
 
@@ -142,10 +140,10 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
 def build_cost(panels: int) -> tuple[float, float]:
     """Estimated processor time [s] and memory [byte] of building a field of so many panels.
 
-    From builds of 5,262 panels (62 s, ``examples/layout/slider_counts.py``), of 7,994 (110 s,
-    ``examples/painted_skin.py``) and of 9,013 (3.2 GB), on two slow cores.
+    From builds of 297 panels (5 s, ``docs/tutorials/electrodes.md``), of 2,957 (26 s,
+    ``three_stripes``), of 6,228 (48 s, ``six_patch``) and of 9,013 (3.2 GB), on two slow cores.
     """
-    return 8.0 + 2e-6 * panels**2, 4e8 + 33.0 * panels**2
+    return 4.0 + 6.5e-3 * panels + 1.5e-11 * panels**3, 4e8 + 33.0 * panels**2
 
 
 def _fitted(design: Design) -> float:
@@ -268,6 +266,7 @@ class BoundarySolution:
         self.contrast = (self.model.eps_front - self.model.eps_back) / (
             self.model.eps_front + self.model.eps_back
         )
+        self._interfaces = np.flatnonzero(owner == INTERFACE)
         self.kind = np.where(owner == INTERFACE, 1 + any(k.facets != () for k in design.layers), 0)
         matrix = kernels.system_matrix(self.kind, self.contrast, self.model.floor, panels)
         progress("boundary elements: factorising")
@@ -286,48 +285,40 @@ class BoundarySolution:
         rhs[driven] = potentials[owner[driven]]
         if sources is not None:
             points = np.ascontiguousarray(sources)
-            rhs += self._source_terms(points, self._potentials(points))
+            rhs += self._source_terms(self._potentials(points), self._fluxes(points))
         return UNIT * self.solve(rhs)
 
     def solve(self, sides: Array) -> Array:
         """Charge densities over 4π eps0 of right-hand sides in the order of the panels, (n, k)."""
-        return np.asarray(scipy.linalg.lu_solve(self._lu, sides, trans=1))
+        matrix, pivots = self._lu
+        # SciPy counts pivots up while LAPACK has them, and down again: each thread has its own.
+        return np.asarray(scipy.linalg.lu_solve((matrix, pivots.copy()), sides, trans=1))
 
-    def responses(self, points: Array, densities: Array) -> tuple[Array, Array]:
-        """Potentials at points [m] of what charges at all of them draw, and of densities.
-
-        Args:
-            points: Shape (n, 3). Each in turn has a point charge of 4π eps0 · 1 V·m, with all
-                terminals at ground.
-            densities: Charge densities on the panels [C/m²], shape (panels, k).
-
-        Returns:
-            The potentials of the charges that are drawn, without those of the point charges [V],
-            shape (n, n); and of the densities [V], shape (n, k).
-        """
-        potentials = self._potentials(points)
-        drawn = np.empty((len(points), len(points)))
-        for start in range(0, len(points), _SIDES):
-            some = slice(start, start + _SIDES)
-            drawn[:, some] = potentials @ self.solve(
-                self._source_terms(points[some], potentials[some])
-            )
-        return drawn, potentials @ (densities / UNIT)
+    def answers(self, points: Array) -> Answers:
+        """What point charges at points [m] draw while all terminals are at ground, (n, 3)."""
+        return Answers(self, np.ascontiguousarray(points))
 
     def _potentials(self, points: Array) -> Array:
         """Potentials at points of unit densities, times 4π eps0, (n, 3) -> (n, panels)."""
         return kernels.potential_matrix(points, self.model.floor, self.model.panels)
 
-    def _source_terms(self, points: Array, potentials: Array) -> Array:
-        """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
-        panels, floor = self.model.panels, self.model.floor
+    def _fluxes(self, points: Array) -> Array:
+        """Fluxes of unit 1/r sources at points through the panels of interfaces, (n, rows)."""
+        rows, model = self._interfaces, self.model
+        if not len(rows):
+            return np.empty((len(points), 0))
+        return kernels.flux_matrix(points, rows, model.floor, model.panels)
+
+    def _source_terms(self, potentials: Array, fluxes: Array) -> Array:
+        """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k).
+
+        Of sources with other charges, by :meth:`_potentials` and :meth:`_fluxes` times these.
+        """
         rhs = np.negative(potentials).T  # as LAPACK has it
-        rows = np.flatnonzero(self.model.owner == INTERFACE)
-        if len(rows):
+        if len(self._interfaces):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
-            flux = kernels.flux_matrix(points, rows, floor, panels)
-            rhs[rows] = self.contrast[rows, None] * flux.T
-        rhs /= panels.areas[:, None]
+            rhs[self._interfaces] = self.contrast[self._interfaces, None] * fluxes.T
+        rhs /= self.model.panels.areas[:, None]
         return rhs
 
     def free_densities(self, densities: Array) -> Array:
@@ -360,3 +351,42 @@ class BoundarySolution:
             block = np.ascontiguousarray(points[start : start + chunk])
             out[start : start + chunk] = self._potentials(block) @ scaled
         return out
+
+
+class Answers:
+    """Potentials at points of the charges that a grounded design answers with to charges there.
+
+    They make a matrix D [1/m], shape (n, n): at each point, the potential of what a charge of 4π
+    eps0 · 1 V·m at each of them draws, without that of the charge itself. D = P A⁻¹ T is never
+    made as a whole: A is the system of the boundary elements, P the potentials of their panels at
+    the points, and T their right-hand sides.
+
+    Args:
+        solution: The factorised boundary elements of the design.
+        points: Where potentials and charges are [m], shape (n, 3).
+    """
+
+    def __init__(self, solution: BoundarySolution, points: Array) -> None:
+        self._solution = solution
+        self._potentials, self._fluxes = solution._potentials(points), solution._fluxes(points)
+
+    def of_densities(self, densities: Array) -> Array:
+        """Potentials of charge densities on the panels [C/m²] at the points [V], (n, k)."""
+        return self._potentials @ (densities / UNIT)
+
+    def by(self, charges: Array) -> Array:
+        """D Q of charges Q at the points, shape (n, k) -> (n, k).
+
+        It takes k solutions of the boundary elements, where all of D takes n.
+        """
+        return self._potentials @ self._drawn(charges.T @ self._potentials, charges)
+
+    def between(self, charges: Array) -> Array:
+        """Qᵀ D Q of charges Q at the points, shape (n, k) -> (k, k)."""
+        sides = charges.T @ self._potentials
+        return sides @ self._drawn(sides, charges)
+
+    def _drawn(self, potentials: Array, charges: Array) -> Array:
+        """Densities over 4π eps0 that charges draw, from their potentials too, (panels, k)."""
+        fluxes = charges.T @ self._fluxes
+        return self._solution.solve(self._solution._source_terms(potentials, fluxes))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -20,7 +21,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from threadpoolctl import threadpool_limits
 
+from capsense._thread_pool import processors
 from capsense.constants import EPS0, UNIT
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
@@ -65,6 +68,8 @@ _CELL = 0.6
 """Size of the cells of the table, over the validity distance."""
 _CELLS = 16_000
 """At most about so many cells."""
+_AT_ONCE = 4
+"""At most so many distances are solved for at a time: each takes memory."""
 _PART = 500
 """So many panels at a time have their potentials averaged."""
 _LEAST = 0.003
@@ -190,14 +195,24 @@ def build_gap_table(
     plates = plates_of(plane.panels, design)
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
     response, errors = PlaneResponse(solution), np.full(len(heights), np.inf)
-    for k, height in enumerate(heights):
-        progress(f"response to a plane: {k + 1} of {len(heights)}")
-        panels = plane.at(top + height)
+
+    @threadpool_limits.wrap(limits=1, user_api="blas")  # with OpenMP it is one for each thread
+    def solve(k: int) -> None:
+        panels = plane.at(top + heights[k])
         found = response.at(panels, densities)
         changes[k] = found.change[: model.sheet_panels]
-        if green is not None and height >= _SOUGHT * unit:
+        if green is not None and heights[k] >= _SOUGHT * unit:
             errors[k] = energy_error(found, panels, plates, green)
-        del found
+
+    with ThreadPoolExecutor(min(_AT_ONCE, processors()), "capsense") as pool:
+        parts = [pool.submit(solve, k) for k in range(len(heights))]
+        try:
+            for k, part in enumerate(parts):
+                progress(f"response to a plane: {k + 1} of {len(heights)}")
+                part.result()
+        finally:
+            for part in parts:  # after an interrupt, those that have not begun
+                part.cancel()
     validity = unit if green is None else valid_from(heights, errors)
     return _cells_of(solution, changes, heights, top, validity, plane.panels)
 
@@ -254,8 +269,12 @@ def _means(green: GreenFunction, plane: Panels) -> tuple[Array, Array]:
     parts = []
     for start in range(0, plane.size, _PART):
         some = slice(start, start + _PART)
-        both = np.hstack(green.psi_and_phi0(plane.quad[some].reshape(-1, 3)))
-        parts.append(np.einsum("mqk,mq->mk", both.reshape(*share[some].shape, -1), share[some]))
+        used = plane.weights[some] > 0.0  # panels of few corners have fewer points
+        both = np.hstack(green.psi_and_phi0(plane.quad[some][used]))
+        panel = np.repeat(np.arange(len(used)), used.sum(axis=1))
+        where = panel, np.arange(len(panel))
+        mean = csr_array((share[some][used], where), (len(used), len(panel)))
+        parts.append(mean @ both)
     means = np.concatenate(parts)
     return means[:, : green.n_modes], means[:, green.n_modes :]
 

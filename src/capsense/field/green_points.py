@@ -167,10 +167,17 @@ def spread(points: Array, scale: Array, count: int) -> NDArray[np.intp]:
     chosen = np.empty(count, dtype=np.intp)
     nearest = np.full(len(points), np.inf)
     pick = int(np.argmin(points @ [1.0, 1.1, 1.2]))
-    for k in range(count):
+    columns, square = np.ascontiguousarray(points.T), scale**2
+    away, along = np.empty((2, len(points)))
+    for k in range(count):  # in place: no memory is fetched anew for each of them
         chosen[k] = pick
-        nearest = np.minimum(nearest, ((points - points[pick]) ** 2).sum(axis=1) / scale**2)
-        pick = int(np.argmax(nearest))
+        away[:] = 0.0
+        for x in columns:
+            np.subtract(x, x[pick], out=along)
+            away += np.square(along, out=along)
+        away /= square
+        np.minimum(nearest, away, out=nearest)
+        pick = int(nearest.argmax())
     return chosen
 
 

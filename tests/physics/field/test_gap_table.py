@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
 from approximate import approx
+from threadpoolctl import threadpool_limits
 
 from capsense.constants import EPS0
 from capsense.design import parse_design
 from capsense.design.model import Design
 from capsense.field.boundary import Accuracy, BoundarySolution
 from capsense.field.face import has_even_face, plane_panels
-from capsense.field.gap_table import PlaneResponse, build_gap_table
-from capsense.field.green_points import is_flat
+from capsense.field.gap_table import PlaneResponse, _means, build_gap_table
+from capsense.field.green import build_green
+from capsense.field.green_points import GreenSettings, is_flat
 from capsense.field.plane_tables import GapTable, from_arrays, to_arrays
 
 UNIT = 1.2e-3
@@ -125,6 +128,32 @@ def test_charges_are_those_of_design_and_plane_solved_anew():
         np.testing.assert_allclose(found[:2], (both[:2, :2] - alone)[i], rtol=0.03, atol=2e-15)
         assert found[2] == approx(both[i, 2], rel=0.03)
     assert len(change) == n
+
+
+def test_threads_solve_beside_each_other():
+    """Regression: SciPy changes the pivots of a factorisation while LAPACK has them."""
+    solution, _ = _solved(PAD)
+    sides = np.random.default_rng(1).normal(size=(solution.model.panels.size, 300))
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(4) as pool:
+        expected = solution.solve(sides)
+        for found in pool.map(lambda _: solution.solve(sides), range(40)):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_means_over_panels_are_those_of_all_points_of_their_quadratures():
+    """Differential: panels have different numbers of points, the others of which weigh nothing."""
+    solution, densities = _solved(PAD)
+    few = GreenSettings(near_sources=60, middle_sources=40, far_sources=20, training=100, wide=50,
+                        far_training=200)  # fmt: skip
+    green = build_green(solution, densities, settings=few)
+    plane = plane_panels(solution, 8 * UNIT).at(0.003)
+    assert len(set((plane.weights > 0.0).sum(axis=1))) > 1
+    psi, phi = (f(plane.quad.reshape(-1, 3)) for f in (green.psi, green.phi0))
+    found = _means(green, plane)
+    for values, means in zip((psi, phi), found, strict=True):
+        each = values.reshape(*plane.weights.shape, -1)
+        expected = np.einsum("mqk,mq->mk", each, plane.weights) / plane.areas[:, None]
+        np.testing.assert_allclose(means, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_it_comes_back_from_arrays():

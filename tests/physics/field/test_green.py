@@ -282,6 +282,23 @@ def test_points_of_the_fit_are_all_over_the_domain() -> None:
     assert set(upper @ [1, 2, 4]) == set(range(8))
 
 
+@pytest.mark.parametrize("name", ["flat", "guarded"])
+def test_answers_by_factors_are_those_of_single_charges(name: str) -> None:
+    """Differential: against the densities that each charge draws; guarded has interfaces."""
+    it, rng = case(name), np.random.default_rng(3)
+    points = somewhere(it, 30)
+    zero = np.zeros((it.densities.shape[1], len(points)))
+    exact = it.solution.potential(points, it.solution.densities(zero, points))
+    answers, charges = it.solution.answers(points), rng.normal(size=(len(points), 7))
+    size = np.abs(exact).max()
+    np.testing.assert_allclose(answers.by(np.eye(len(points))), exact, rtol=0, atol=1e-11 * size)
+    between = charges.T @ exact @ charges
+    found = answers.between(charges)
+    np.testing.assert_allclose(found, between, rtol=0, atol=1e-11 * np.abs(between).max())
+    phi = it.solution.potential(points, it.densities)
+    np.testing.assert_allclose(answers.of_densities(it.densities), phi, rtol=1e-9, atol=1e-12)
+
+
 def test_misfit_is_that_of_the_points_of_the_fit() -> None:
     """Analytic, of every fourth point, weighted by its distance d: d^¾ / (1 + d / 50 mm)."""
     it = case("flat")
@@ -389,6 +406,20 @@ def test_spread_takes_the_farthest_point_every_time() -> None:
     closest = np.where(np.eye(40, dtype=bool), np.inf, gaps).min()
     reach = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
     assert reach.max() <= closest
+
+
+def test_spread_takes_the_same_points_as_its_definition() -> None:
+    """Differential, to the last bit: with all distances from each chosen point anew."""
+    rng = np.random.default_rng(4)
+    points, scale = rng.normal(size=(900, 3)), rng.uniform(1.0, 5.0, 900)
+    nearest = np.full(900, np.inf)
+    pick, expected = int(np.argmin(points @ [1.0, 1.1, 1.2])), []
+    for _ in range(300):
+        expected.append(pick)
+        square = ((points - points[pick]) ** 2).sum(axis=1) / scale**2
+        nearest = np.minimum(nearest, square)
+        pick = int(np.argmax(nearest))
+    assert spread(points, scale, 300).tolist() == expected
 
 
 def test_tables_are_rounded_to_the_nearest() -> None:
