@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -82,6 +83,10 @@ class BackgroundField:
     """Answer of the grounded design to charges anywhere, and the terminals' potentials."""
 
 
+_WRONG = 1e-4
+"""Mutual capacitances of the wrong sign that are smaller, over √(C_ii C_jj), are rounding errors of
+conductors that are screened from each other."""
+
 _STAGES = {
     "boundary elements: factorising": 0.1,
     "response to charges: where": 0.15,
@@ -145,6 +150,31 @@ def empty_capacitance(design: Design, settings: BuildSettings | None = None) -> 
     """
     with threadpool_limits(1, "blas"):
         return solve_empty(design, settings or BuildSettings(), lambda _: None)[2]
+
+
+def warn_of_signs(design: Design, capacitance: Array) -> None:
+    """Warn where conductors come out with less than no capacitance between them.
+
+    No entry of a Maxwell matrix off its diagonal is positive: with one conductor at 1 V, potentials
+    are nowhere below 0, and charges of those at ground not above it (maximum principle). One that
+    is positive has an error of at least its size.
+
+    Args:
+        design: The design.
+        capacitance: Maxwell matrix of its terminals in the empty domain [F], shape (t, t).
+    """
+    own = np.sqrt(capacitance.diagonal())
+    share = np.triu(capacitance / own / own[:, None], 1)
+    i, j = divmod(int(share.argmax()), len(share))
+    if share[i, j] > _WRONG:
+        names = terminals(design)
+        warnings.warn(
+            f"design {design.name!r}: the panels are too coarse for its baseline; the mutual "
+            f"capacitance of {names[i]} and {names[j]} has the wrong sign, by "
+            f"{1e12 * capacitance[i, j]:.2g} pF; raise [build] resolution above "
+            f"{design.resolution:g}: capsense design FILE --tolerance 1% finds one that is enough",
+            stacklevel=4,
+        )
 
 
 def solve_empty(

@@ -38,6 +38,7 @@ from capsense.field.background import (
     BuildSettings,
     Progress,
     build_background,
+    warn_of_signs,
 )
 from capsense.field.boundary import terminals
 from capsense.field.green import TABLES, from_arrays, to_arrays
@@ -264,6 +265,9 @@ def load_or_build(
             when nothing is built. Without one, a build that takes longer than :data:`EVERY` says so
             as a warning of the logger, and again after as much time.
 
+    Warns:
+        UserWarning: The panels are too coarse for the capacitances (:func:`warn_of_signs`).
+
     Raises:
         FieldError: The field could not be built.
     """
@@ -275,6 +279,7 @@ def load_or_build(
         field = _cached(folder, key, warn=False)
     if field is None:
         field = _wait_or_build(design, settings, folder, key, progress)
+    warn_of_signs(design, field.capacitance)
     return replace(field, terminals=tuple(terminals(design)))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import warnings
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -184,3 +185,28 @@ def test_an_unusable_field_is_told_once_by_who_builds_it_again(
     assert digest(field) == digest(built)
     assert [r.levelno for r in caplog.records] == ([] if mended else [logging.WARNING])
     assert digest(load_background(path, key)) == digest(built)
+
+
+@pytest.mark.parametrize(
+    ("mutual", "told"), [(-0.2, False), (-1e-9, False), (5e-5, False), (2e-4, True), (0.2, True)]
+)
+def test_a_mutual_capacitance_of_the_wrong_sign_is_warned_of(
+    built: BackgroundField, tmp_path: Path, mutual: float, told: bool
+) -> None:
+    """Invariant: it may not be positive in a Maxwell matrix, but for rounding; the warning names
+    conductors, size and fix, also where the field comes from the cache."""
+    design, own = tiny_design(), np.sqrt(built.capacitance.diagonal())
+    capacitance = built.capacitance.copy()
+    capacitance[0, 1] = capacitance[1, 0] = mutual * own[0] * own[1]
+    field = replace(built, capacitance=capacitance)
+    key = cache_key(design, SETTINGS)
+    save_background(field, tmp_path / f"{key}.npz", key)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        load_or_build(design, SETTINGS, cache_dir=tmp_path)
+    assert len(found) == told
+    if told:
+        text = str(found[0].message)
+        size = f"{1e12 * capacitance[0, 1]:.2g} pF"
+        for part in ("A and B", size, "[build] resolution above 1", "--tolerance 1%"):
+            assert part in text
