@@ -18,10 +18,10 @@ MARKERS = ("<!-- materials -->", "<!-- end of materials -->")
 
 def table() -> str:
     """Materials and paths to ground of ``materials.toml``, in Markdown."""
-    lines = ["| material | ε<sub>r</sub> | σ (S/m) |", "| --- | --- | --- |"]
+    lines = ["| material | ε<sub>r</sub> | σ (S/m) | source |", "| --- | --- | --- | --- |"]
     for name, m in MATERIALS.items():
         sigma = f"{m.sigma:.3g}" if m.sigma else "–"
-        lines.append(f"| {name} | {m.eps_r:g} | {sigma} |")
+        lines.append(f"| {name} | {m.eps_r:g} | {sigma} | {m.source} |")
     conductors = [name for name, m in MATERIALS.items() if m.is_conductor()]
     lost = [name for name in conductors if not MATERIALS[name].is_conductor(1e6)]
     lines += [
@@ -30,11 +30,14 @@ def table() -> str:
     ]
     other = ", ".join(f"{new} = {old}" for new, old in DATA["aliases"].items())
     lines += ["", f"Other names: {other}.", ""]
-    lines += ["| path to ground | C (pF) | in series (Ω) |", "| --- | --- | --- |"]
+    lines += [
+        "| path to ground | C (pF) | in series (Ω) | source |",
+        "| --- | --- | --- | --- |",
+    ]
     for name, path in DATA["ground_paths"].items():
         series = f"{path['series']:g}" if "series" in path else "–"
         farads = f"{path['capacitance'] * 1e12:g}"
-        lines.append(f"| {name} | {farads} | {series} |")
+        lines.append(f"| {name} | {farads} | {series} | {path['source']} |")
     return "\n".join(lines)
 
 
