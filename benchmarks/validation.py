@@ -272,7 +272,7 @@ def inside() -> str:
     unnoticed = [name for name, errors in told.items() if errors[-2] < 0.1]
     return (
         f"5 mm below the face `solver_error` is {least:.0f} % of the largest entry or more. "
-        f"1 mm below, it does not tell of: {', '.join(unnoticed) or 'none'}."
+        f"1 mm below, it does not cover: {', '.join(unnoticed) or 'none'}."
     )
 
 
