@@ -186,3 +186,20 @@ def test_a_limb_that_leaves_the_box_keeps_its_tie(simulators):
     short, long = limb(0.2, 100e-12), limb(2.0, 100e-12)
     assert long == approx(short, rel=0.015)
     assert limb(2.0, "grounded") > 1.03 * long
+
+
+def test_grounded_plates_above_each_other(simulators):
+    """They are not held apart: on each other they read up to 16 % too much, as the theory says."""
+
+    def plate(z: float, thickness: float) -> cs.Body:
+        pose = cs.Pose((0.0, 0.0, z + thickness / 2))
+        return cs.Body(cs.Box((0.06, 0.06, thickness)), pose, "steel")
+
+    def ratio(second: float, whole: float) -> Array:
+        sim = simulators("six_patch_bare")
+        pair = delta(sim, plate(3e-3, 1e-4), plate(second, 1e-4)).diagonal()
+        return pair / delta(sim, plate(3e-3, whole)).diagonal() - 1
+
+    touching = ratio(3.1e-3, 2e-4)
+    assert 0.0 < touching.min() < touching.max() < 0.17
+    assert np.abs(ratio(4.1e-3, 1.2e-3)).max() < 0.04
