@@ -52,7 +52,7 @@ class Draw:
             number = int(self.rng.integers(len(options)))
             name, kind = _choice(options, path)
             self.drawn[PREFIX + name] = number if kind is int else kind(options[number])
-            return self.value(options[number], table, path)
+            return self.value(options[number], table, _path_of(options[number], number, path))
         if "from" in value or "to" in value:
             span = ScenarioTable(value, table.source, f"{table.item}: {{ from, to }}")
             self.drawn[PREFIX + path] = found = _number(span, self.rng)
@@ -90,8 +90,8 @@ def columns_of(value: Any, table: ScenarioTable, path: str) -> Iterator[tuple[st
         options = _options(value, table)
         name, kind = _choice(options, path)
         yield PREFIX + name, kind
-        for option in options:
-            yield from columns_of(option, table, path)
+        for number, option in enumerate(options):
+            yield from columns_of(option, table, _path_of(option, number, path))
     elif "from" in value or "to" in value:
         yield PREFIX + path, float
     else:
@@ -121,6 +121,12 @@ def _choice(options: list[Any], path: str) -> tuple[str, type]:
         if all(isinstance(o, given) and (kind is bool or type(o) is not bool) for o in options):
             return path, kind
     return f"{path}.any", int
+
+
+def _path_of(option: Any, number: int, path: str) -> str:
+    """Where an option notes what is random in it: a choice of its own not where this one does."""
+    nested = isinstance(option, Mapping) and "any" in option
+    return f"{path}.any.{number}" if nested else path
 
 
 def _number(span: ScenarioTable, rng: Generator) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import capsense as cs
@@ -97,7 +97,10 @@ def random_leaves(value: Any, path: str) -> set[str]:
         kinds = {"number" if type(o) in (int, float) else type(o) for o in value["any"]}
         plain = len(kinds) == 1 and kinds <= {"number", str, bool}
         own = {path if plain else f"{path}.any"}
-        return own.union(*(random_leaves(o, path) for o in value["any"]))
+        for k, option in enumerate(value["any"]):
+            nested = isinstance(option, dict) and "any" in option
+            own |= random_leaves(option, f"{path}.any.{k}" if nested else path)
+        return own
     out = set().union(*(random_leaves(v, f"{path}.{k}") for k, v in value.items()))
     return out | ({f"{path}.quaternion"} if value.get("quaternion") == "uniform" else set())
 
@@ -281,6 +284,8 @@ VALUES = st.recursive(
 
 
 @given(st.dictionaries(st.sampled_from(["radius", "pose", "shape"]), VALUES), st.integers(0, 2**32))
+@example({"radius": {"any": [0.0, 0.0, {"any": [0.0, "steel"]}]}}, 0)
+@example({"radius": {"any": [{"any": [1.0, 2.0]}, {"any": [1.0, "steel"]}]}}, 0)
 @settings(max_examples=200, deadline=None)
 def test_whatever_is_drawn_is_noted(raw: dict[str, Any], seed: int) -> None:
     """Of any table: decided values are noted under columns that are known beforehand.
